@@ -262,6 +262,19 @@ def test_what_cannot_be_poses_is_an_input_error(gripper, camera, words):
         solve_hand_eye(gripper, camera)
 
 
+@pytest.mark.parametrize(("factor", "options", "words"), [
+    (1e3, {}, "up to .* m from the base; these look like millimetres"),
+    (1, {"names": ["a"]}, "names: 1 name for 8 poses"),
+    (1, {"robot_noise": (1.0, 0.0)}, "robot_noise: .*must be two positive numbers"),
+])  # fmt: skip
+def test_wrong_units_and_arguments_are_input_errors(factor, options, words):
+    problem = hand_eye_problem(np.random.default_rng(3), 8)
+    gripper = problem.base_from_gripper * np.array([1, 1, 1, factor])
+    gripper[:, 3, 3] = 1
+    with refused(words):
+        solve_hand_eye(gripper, problem.recon_from_camera, **options)
+
+
 def test_equal_poses_are_rejected_without_a_warning_of_numpy():
     for seed in range(6):
         problem = hand_eye_problem(np.random.default_rng(seed), 2)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import errors_of
 from jcr.calibration.verdict import MIN_FOR_OUTLIERS, judged, poses_agree
-from jcr.errors import InputError
+from jcr.capture.checks import far_faults
+from jcr.errors import InputError, count_of
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import camera_error_covariance
 from jcr.estimation.closed_form import initial_estimate
@@ -56,8 +57,8 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
 ) -> Calibration:
     """Calibrate from pairs of gripper and camera poses: gripper_from_camera, scale of the camera poses, covariance.
 
-    Both pose arguments are stacks (n,4,4), n ≥ 2, at the same instants and in the same order. Gripper poses are in the
-    base frame (m), camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses
+    Both pose arguments are stacks (n,4,4), at the same instants and in the same order. Two poses are always rejected.
+    Gripper poses are in the base frame (m), camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses
     (1 sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is the covariance of errors of
     the camera poses, as steps (geometry.retract). Each pose has six rows: translation (unit of the camera poses), then
     rotation vector (rad), in axes of their frame.
@@ -87,8 +88,14 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         raise InputError(
             f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
         )
+    names = [f"pose {k}" for k in range(n)] if names is None else list(names)
     known = None if scale is None else (scale, scale_std)
     _require_possible(n, len(camera), known, robot_noise)
+    if len(names) != n:
+        raise InputError(f"names: {count_of(len(names), 'name')} for {n} poses; give one per pose")
+    if camera_errors not in get_args(CameraErrors):
+        raise InputError(f"camera_errors: {camera_errors!r:.80}; give one of {get_args(CameraErrors)}")
+    far_faults(gripper[:, :3, 3], "base_from_gripper", names)
     offsets = () if offset is None else (offset_prior(*offset),)
     model = PoseModel(
         camera_covariance=camera_covariance,
@@ -96,7 +103,6 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         noise_floor=robot_noise,
         priors=offsets if known is None else (*offsets, scale_prior(*known)),
     )
-    names = [f"pose {k}" for k in range(n)] if names is None else names
     fit = fit_poses(gripper, camera, names, model, camera_errors)
     return judged(fit, fit.findings)
 
@@ -118,8 +124,10 @@ def _require_possible(
         raise InputError(
             f"scale: {scale[0]} ± {scale[1]} must be two positive numbers (m per unit, relative)"
         )
-    if robot_noise is not None and not (np.isfinite(robot_noise).all() and min(robot_noise) > 0):
-        raise InputError(f"robot_noise: {robot_noise} must be two positive numbers (m, rad)")
+    if robot_noise is not None and not (
+        np.shape(robot_noise) == (2,) and np.isfinite(robot_noise).all() and min(robot_noise) > 0
+    ):
+        raise InputError(f"robot_noise: {robot_noise!r:.80} must be two positive numbers (m, rad)")
 
 
 def fit_poses(

@@ -77,7 +77,8 @@ def require_frames(count: int, where: str, at_least: int = MIN_FRAMES) -> None:
     if count > MAX_FRAMES:
         raise InputError(f"{where}: {count_of(count, 'frame')}; choose 5 to 15, {MAX_FRAMES} at most")
     if count < at_least:
-        raise InputError(f"{where}: {count_of(count, 'frame')}; at least {at_least} are needed; take 5 to 15")
+        needed = f"at least {at_least} are needed; take 5 to 15" if at_least > 1 else "at least one is needed"
+        raise InputError(f"{where}: {count_of(count, 'frame')}; {needed}")
 
 
 def require_motion(base_from_gripper: Float[ndarray, "n 4 4"], where: str) -> None:

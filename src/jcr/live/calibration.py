@@ -79,6 +79,10 @@ class LiveCalibration:
         self._is_closed = False
         self.progress = LiveProgress(images=tuple(self.live.names))
 
+    def __repr__(self) -> str:
+        """Return the folder of the capture, and the state of the calibration."""
+        return f"<LiveCalibration {self.live.folder}: {self.progress!r}>"
+
     def add(
         self,
         image: ArrayLike,
