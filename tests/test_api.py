@@ -147,6 +147,7 @@ def test_a_pixel_and_its_depth_give_a_point_in_the_base_from_lists_and_arrays(tm
         ([320, 240], 500.0, gripper, "no depth"),  # millimetres
         ([320, 240], np.nan, gripper, "no depth"),
         ([-20, 240], 0.4, gripper, "outside of the image"),
+        ([320, 240], 0.4, transform(gripper[:3, :3], 1e3 * gripper[:3, 3]), "these look like millimetres"),
         ([320], 0.4, gripper, "x and y"),
         ([[320, 240]] * 2, [0.4] * 3, gripper, "one depth for each"),
         ([320, 240], 0.4, gripper[:3, :3], "4×4"),

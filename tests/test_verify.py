@@ -246,7 +246,9 @@ def test_images_of_a_calibration_are_refused_by_content(out: Path, capture: Capt
     file = today.folder / "capture.json"
     file.write_text(file.read_text().replace(Path(capture.images[3]).name, "fresh.jpg"))
     assert dispatch(["verify", str(out), str(today.folder)]) == 2
-    assert f"fresh.jpg: equals image {capture.images[3]} of the calibration" in capsys.readouterr().err
+    assert (
+        f"fresh.jpg: is the same image as {capture.images[3]} of the calibration" in capsys.readouterr().err
+    )
 
 
 def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(out, capture, x, tmp_path, capsys):
@@ -284,8 +286,13 @@ def test_a_start_check_in_python_counts_an_image_once(out: Path, capture: Captur
     run.verify([files[9]], poses[[9]], name="next")
     with refused("verified before"):
         run.verify(files[9:11], poses[9:11])
-    with refused("n images"):
+    with refused("for 2 images; give a pose"):
         run.verify(files[9:11], poses[[9]])
+    far = np.array(poses[6:9])
+    far[:, :3, 3] *= 1e3
+    with refused("these look like millimetres"):
+        run.verify(files[6:9], far, name="far")
+    assert [row.name for row in run.verify(files[10:12], poses[10:12]).history] == ["start", "next"]
 
 
 def test_the_poses_that_tell_most_are_those_of_the_run(done: Path, capsys):

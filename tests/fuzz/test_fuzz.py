@@ -253,17 +253,17 @@ MANY = {
     "missing images": (
         "capture.json",
         {"frames": [FRAME | {"image": f"images/{k}.png"} for k in range(30_000)]},
-        "30000 frames; choose 1000 at most",
+        "30000 frames; choose 5 to 15, 1000 at most",
     ),
     "this many images": (
         "capture.json",
         {"frames": [FRAME | {"image": f"l{k}.png"} for k in range(1001)]},
-        "1001 frames; choose 1000 at most",
+        "1001 frames; choose 5 to 15, 1000 at most",
     ),
     "samples": (
         "samples.yaml",
         [dict.fromkeys(("effector_wrt_world", "object_wrt_sensor"), np.eye(4).ravel().tolist())] * 1001,
-        "1001 frames; choose 1000 at most",
+        "1001 frames; choose 5 to 15, 1000 at most",
     ),
     "rows": (
         "poses.csv",

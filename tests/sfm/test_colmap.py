@@ -236,3 +236,17 @@ def test_images_that_leave_and_come_back_are_matched_once(tabletop: Path, monkey
     assert off_mm(capture, live) < 1.0 and live.registered == list(range(6))
     capture = update(list(range(7)), [2])
     assert off_mm(capture, live) < 1.0 and live.matched_with(2) >= 3
+
+
+def test_a_live_map_that_many_images_do_not_fit_begins_anew(tabletop: Path):
+    whole = jcr.read_capture(tabletop).of_rows(list(range(7)))
+    live = LiveMap(whole)
+    live.update(whole, {name: read_image(tabletop / name) for name in whole.images})
+    model = live._model
+    assert model is not None and model.num_reg_images() == 7
+    for image_id in (4, 5, 6, 7):
+        model.deregister_frame(model.image(image_id).frame_id)
+    model.camera(1).params = [10, 10, 1, 1] * np.asarray(model.camera(1).params[:4])
+    assert live.registered == [0, 1, 2]
+    live.update(whole, {})
+    assert off_mm(whole, live) < 1.0

@@ -68,7 +68,7 @@ def viewer(done: Path, capture: Capture, gantry: Path) -> "Iterator[Viewer]":
 
     server = module.open_server(0, "test")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "MOST_POINTS", 15_000)  # drawn without a graphics card
+        patch.setattr(module, "MOST_DRAWN", 15_000)  # drawn without a graphics card
         yield module.Viewer(server, RunResult(done, capture=capture), gantry)
     server.stop()
 

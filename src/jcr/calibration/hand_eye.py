@@ -58,10 +58,10 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     """Calibrate from pairs of gripper and camera poses: gripper_from_camera, scale of the camera poses, covariance.
 
     Both pose arguments are stacks (n,4,4), at the same instants and in the same order. Two poses are always rejected.
-    Gripper poses are in the base frame (m), camera poses in any frame and unit. `robot_noise` is a lower bound on the noise of the gripper poses
-    (1 sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is the covariance of errors of
-    the camera poses, as steps (geometry.retract). Each pose has six rows: translation (unit of the camera poses), then
-    rotation vector (rad), in axes of their frame.
+    Gripper poses are in the base frame (m), camera poses in any frame and unit. `robot_noise` is a lower bound on the
+    noise of the gripper poses (1 sigma per axis: m, rad); the residuals may show more. `camera_covariance` (6n,6n) is
+    the covariance of errors of the camera poses, as steps (geometry.retract). Each pose has six rows: translation (unit
+    of the camera poses), then rotation vector (rad), in axes of their frame.
 
     `robot` names the arm (jcr.estimation.arms.ROBOT_NAMES), and `joints` (n,dof) are its angles (rad), starting at the
     base. They determine how joint offsets and link errors affect the poses. With `robot` only, the angles are computed

@@ -22,6 +22,7 @@ from pydantic import (
 )
 
 import jcr
+from jcr.capture.checks import far_faults
 from jcr.errors import InputError, RejectedError, first_fault, shown
 from jcr.estimation.point_uncertainty import point_in_base
 from jcr.files import written_whole
@@ -381,6 +382,7 @@ class Calibration(Outcome):
             )
         self._require_visible(self.intrinsics, pixel, depth_m)
         pose = require_rigid(pose, "base_from_gripper")
+        far_faults(pose[None, :3, 3], "base_from_gripper", ["the pose"])
         return point_in_base(x, self.uncertainty, self.intrinsics, self.robot_noise, pixel, depth_m, pose)
 
     def _require_visible(

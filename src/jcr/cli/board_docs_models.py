@@ -99,8 +99,11 @@ def pages() -> dict[str, Path]:
 
 
 def page(name: str) -> str:
-    """Return the Markdown of a page by its name (`captures`, `results/speed`); raise InputError if no page has it."""
+    """Return the Markdown of a page by its name (`captures`, `results/speed`) or a link to it, else raise InputError."""
     found = pages()
+    if name not in found:  # a link of a page, such as ../how-to/exports.md
+        last = name.removesuffix(".md").rpartition("/")[2]
+        name = next((one for one in (last, f"results/{last}") if one in found), name)
     if name not in found:
         count = {other: path.read_text("utf-8").lower().count(name.lower()) for other, path in found.items()}
         speak = sorted((other for other in found if count[other]), key=lambda other: -count[other])[

@@ -242,6 +242,20 @@ class ExportedRun:
         rotation = Rotation.from_quat(quat_xyzw).as_matrix()
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
 
+    def root_in_words(self, contents: str) -> str | None:
+        """Return a sentence on the assumed origin of the camera's root link; None for an export without that link."""
+        options = self.options
+        if (
+            options.to_root is None
+            or options.root_from_optical is not None
+            or "mount" not in contents.split()
+        ):
+            return None
+        return (
+            f"{options.to_root} is taken to have its origin in the optical frame's, with x forward; if a driver states "
+            "another pose, such as 15 mm beside it, give --root-from-optical"
+        )
+
     def pair_in_words(self, contents: str) -> str | None:
         """Return a sentence on the intrinsics that belong to an export with these contents, and on the other pair.
 
@@ -269,8 +283,8 @@ class ExportedRun:
         if self.options.intrinsics == "given":
             return f"{words}, the given ones; without --intrinsics given: for the refined ones"
         return (
-            f"{words}, the refined ones{command and f' ({command})'}; for the given ones, fx {given.intrinsics.fx:.1f}: "
-            "--intrinsics given"
+            f"{words}, the refined ones{command and f' ({command})'}; for the given ones (fx "
+            f"{given.intrinsics.fx:.2f}): --intrinsics given"
         )
 
     @property

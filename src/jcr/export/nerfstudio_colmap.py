@@ -118,7 +118,10 @@ def write_colmap(folder: Path, views: PosedImages, notes: dict[str, str], option
         model.write_binary(str(sparse))
         model.write_text(str(sparse))
         about = "".join(f"{name}: {text}\n" for name, text in notes.items())
-        (made / "README.txt").write_text(f"{about}The world is that frame; cameras are world to camera.\n")
+        (made / "README.txt").write_text(
+            f"{about}The world is that frame; cameras are world to camera. "
+            "Pixel coordinates are 0 at the image's corner, as COLMAP has them, half a pixel more than those of jcr.\n"
+        )
 
 
 def write_depth(

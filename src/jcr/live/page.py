@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from jcr.calibration.options import RequiredAccuracy
 from jcr.capture.images import encode_jpeg, read_image
+from jcr.errors import count_of
 from jcr.findings import reached_in_words, sentence
 from jcr.live.progress import accuracy_line, advice, faults, finding_lines, reached_accuracy
 from jcr.live.session import LiveSession, SessionState
@@ -72,16 +73,20 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
     """Return a card for each image: its number in commands, file name, the finding about it, and registration state.
 
     Keys: "number" (from 1), "name", "fault" (empty without one), "kind" (CSS class: used, warned or rejected) and
-    "state" ("registered", "not registered" or "new").
+    "state" ("registered", "not registered" or "new"; after the final calibration "used" or "left out").
     """
     progress, against, kinds = state.progress, dict[str, str](), dict[str, str]()
-    for one in progress.findings[::-1]:
+    findings = progress.findings if state.result is None else state.result.calibration.findings
+    for one in findings[::-1]:
         if len(one.images) == 1 and one.severity != "informs":
             against[one.images[0]] = sentence(one)
             kinds[one.images[0]] = "warned" if one.severity == "warns" else "rejected"
     registered = dict.fromkeys(progress.images, "not registered")
     registered |= dict.fromkeys(progress.registered, "registered")
     registered |= dict.fromkeys(filter(None, [state.replaces]), "the next image replaces this one")
+    if state.result is not None:
+        used = {one.image for one in state.result.calibration.images if one.used}
+        registered = {name: "used" if name in used else "left out" for name in state.names}
     return [
         {"number": number, "name": name, "fault": against.get(name, ""), "kind": kinds.get(name, "used")}
         | {"state": registered.get(name, "new")}
@@ -98,8 +103,8 @@ def verdict_lines(state: SessionState) -> list[str]:
         found = [] if required is None or not required.met else [reached_in_words(required)]
         found += [sentence(one) for one in result.calibration.findings if one.severity != "informs"]
         kind = {"accepted": "good", "rejected": "bad"}.get(result.verdict, "fair")
-        where = f"The calibration of all {count} images is in {result.out}."
-        return [kind, result.verdict, *found, where]
+        used = f"{result.calibration.images_used} of {count_of(count, 'image')}"
+        return [kind, result.verdict, *found, f"The calibration uses {used}; it is in {result.out}."]
     if state.is_refusal:
         return ["bad", state.event, *(sentence(one) for one in wrong)]
     if state.event:
@@ -137,8 +142,10 @@ def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
     for k, ((name, unit), value) in enumerate(zip(names, reached, strict=False)):
         limits = [] if required == "none" else [f"required {required[k]:g}{unit}"]
         tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", "; ".join(limits + without), "first"))
-    count = f"{len(state.progress.registered)} of {len(state.images)}"
-    tiles.append(("Images registered", count, "", ""))
+    name, count = "Images registered", len(state.progress.registered)
+    if state.result is not None:
+        name, count = "Images used", state.result.calibration.images_used
+    tiles.append((name, f"{count} of {len(state.images)}", "", ""))
     if error is not None:
         size = f"{significant(error.translation_mm)} mm, {significant(error.rotation_deg)}°"
         px = "" if error.reprojection_px is None else f"{significant(error.reprojection_px)} px"

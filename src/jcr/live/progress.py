@@ -149,6 +149,7 @@ def accuracy_line(state: LiveProgress) -> str:
         if required.met and not state.requirement_met:
             met = "reached, but exceeded by the leave-one-out error"
             if state.leave_one_out is None:
-                met = f"reached, to be confirmed with {CONFIRMING_IMAGES} images"
+                now = state.hand_eye.images_used
+                met = f"reached, to be confirmed with {CONFIRMING_IMAGES} used images ({now} now)"
         line += f"; required {required.translation_mm:g} mm and {required.rotation_deg:g}°: {met}"
     return line

@@ -16,6 +16,7 @@ from scipy.spatial import KDTree
 
 from jcr.calibration.drift import Located
 from jcr.camera import project
+from jcr.capture.checks import far_faults
 from jcr.capture.folder import require_decided
 from jcr.capture.formats import bag
 from jcr.capture.formats.capture_json import origin
@@ -59,7 +60,7 @@ class NewImages:
     ) -> "NewImages":
         """Return n RGB images (h,w,3) uint8 or image files with their gripper poses (n,4,4) and joint angles (n,dof).
 
-        Raises InputError unless there is an image for each rigid pose.
+        Raises InputError unless there is an image for each rigid pose in metres.
         """
         pixels = [read_image(Path(one)) if isinstance(one, str | Path) else np.asarray(one) for one in images]
         names = [
@@ -73,10 +74,12 @@ class NewImages:
         has_angles = angles is None or len(angles) == len(pixels)
         if not pixels or poses.shape != (len(pixels), 4, 4) or not has_angles:
             raise InputError(
-                f"{count_of(len(pixels), 'image')}, poses of shape {poses.shape}; give (n, 4, 4)"
+                f"base_from_gripper: shape {poses.shape} for {count_of(len(pixels), 'image')}; give a pose (4, 4), and "
+                "joint angles, if any, for each"
             )
         for name, pose in zip(names, poses, strict=True):
             require_rigid(pose, f"base_from_gripper of {name}")
+        far_faults(poses[:, :3, 3], "base_from_gripper", names)
         return NewImages(images=names, pixels=pixels, base_from_gripper=poses, joints=angles)
 
     @cached_property
@@ -114,7 +117,7 @@ def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages
             )
         for before, other in zip(then.images, old, strict=True):
             if np.array_equal(image, other):
-                raise InputError(f"{name}: equals image {before} of the calibration; take a new image")
+                raise InputError(f"{name}: is the same image as {before} of the calibration; take a new one")
 
 
 @lru_cache(maxsize=2)

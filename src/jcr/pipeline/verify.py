@@ -20,6 +20,7 @@ from jcr.estimation.robot_noise import REACH
 from jcr.files import locked
 from jcr.findings import Verdict
 from jcr.geometry import Transform, retract, step_between
+from jcr.number_format import significant
 from jcr.pipeline.calibrated_scene import (
     NewImages,
     name_of,
@@ -57,7 +58,7 @@ class Move(NamedTuple):
     """Step of the camera (gripper axes) or the scene (base axes): m, rad; None: the robot's poses changed."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Verification:
     """Result of a verification: the drift of the camera, and the verdict on the old calibration."""
 
@@ -86,6 +87,12 @@ class Verification:
     """Name of the camera if it is a fixed one, whose drift is along base axes; None: the camera on the gripper."""
     others: tuple["Verification", ...] = ()
     """Results for the fixed cameras of the run of which there are new images."""
+
+    def __repr__(self) -> str:
+        """Return the verdict, what has moved, and the smallest change that is detected."""
+        mm, deg = 1e3 * self.detectable[0], np.degrees(self.detectable[1])
+        least = f"detects {significant(mm)} mm, {significant(float(deg))}°"
+        return f"<Verification {self.name}: {self.verdict}, {self.finding}; {least}>"
 
     @property
     def verdict(self) -> Verdict:

@@ -52,8 +52,8 @@ class LiveMap:
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
 
-        Images that are no longer in the capture are removed, and the map then begins anew. With REMAPPED_UP_TO images or
-        fewer, every update begins anew.
+        Images that are no longer in the capture are removed, and the map then begins anew. It also does so in every
+        update with REMAPPED_UP_TO images or fewer, or while fewer than three quarters of the images are registered.
         """
         for name in [name for name in self._names if name not in capture.images]:
             row = self._names.index(name)
@@ -67,6 +67,10 @@ class LiveMap:
                 self._names.append(name)
         self._places = [capture.images.index(name) for name in self._names]
         begun = self._model if len(self._names) > REMAPPED_UP_TO else None
+        if begun is not None and 4 * begun.num_reg_images() < 3 * len(self._names):
+            # A map that many images do not fit has gone astray, with its intrinsics. With one half in place of three
+            # quarters, a real capture stays so for three more images.
+            begun = None
         with quiet_colmap():
             matched, self._model = map_images(
                 self._matcher,

@@ -272,7 +272,8 @@ class Viewer:
             row = self.image.value
             image = self.calibration.images[row]
             state = "used" if image.used else f"rejected: {image.reason}"
-            about = " · ".join(filter(None, (state, image_numbers(image))))
+            numbers = image_numbers(image)
+            about = f"{state}, residuals {numbers}" if numbers else state
             self._about_image.content = _lines((image.image, about))
             for own, frustum in zip(self.image_index.tolist(), self.frusta, strict=True):
                 used = self.calibration.images[own].used
@@ -347,12 +348,12 @@ class Viewer:
             at = self.scene.query(center, unknown)
             self.ball.radius, self.ball.color = radius, COLLIDES if hit else FREE
             distance, (x, y, z) = float(at.distance[0]), center[0]
-            where = f"surface {1e3 * distance:.0f} mm away"
-            where = "outside of the workspace" if np.isnan(distance) else where
+            where = f"the nearest surface is {1e3 * distance:.0f} mm from its centre"
+            where = "it is outside of the workspace" if np.isnan(distance) else where
             seen = "unseen space" if at.unknown[0] else "seen space"
             verdict = "collides" if hit else "free"
             self.answer.content = _lines(
-                (verdict, f"at ({x:.3f}, {y:.3f}, {z:.3f}) m: centre {where}, {seen}")
+                (verdict, f"with its centre at ({x:.3f}, {y:.3f}, {z:.3f}) m, in {seen}: {where}")
             )
 
     def click(self, origin_in_base: Value, direction: Value) -> str:
