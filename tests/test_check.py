@@ -69,6 +69,14 @@ def test_nothing_is_stated_of_an_undecided_reading(small_capture: Path, tmp_path
     assert found["verdict"] == "not checked" and found["expected_std"] is None and found["undecided"]
 
 
+def test_a_motion_that_is_expected_to_miss_the_required_accuracy_is_not_accepted(small_capture: Path):
+    capture = jcr.read_capture(small_capture)
+    few, all_of_them = (check_capture(capture.of_rows(range(n)), look=False) for n in (3, len(capture)))
+    assert few.verdict == "accepted, but not as exact as needed" and few.expected is not None
+    assert all_of_them.verdict == "accepted", all_of_them
+    assert check_capture(capture.of_rows(range(3)), look=False, require="none").verdict == "accepted"
+
+
 def test_poses_that_were_exchanged_are_named_and_one_that_is_wrong_too():
     problem = hand_eye_problem(np.random.default_rng(1), 12, robot_noise=(2e-4, 5e-4))
     right = problem.base_from_gripper
@@ -115,6 +123,8 @@ def test_check_names_the_remedy_the_board_and_the_images_that_a_run_names():
     assert "not as exact as needed, 20 images, a point within" in repr(found)
     (board,) = [one for one in found.findings if one.kind is FindingKind.BOARD_IN_VIEW]
     assert "--board chessboard:11x8:SIDE" in board.remedy
+    plain = check_capture(SHARED / "data/franka_plain_background")
+    assert plain.verdict == "accepted", "SIFT registers no image; a run finds learned features"
     belt = check_capture(SHARED / "attacks/scene_belt")
     assert any("objects seem to have moved" in one for one in warnings_of(belt.findings))
     found = check_capture(SHARED / "data/ur_snack_table")

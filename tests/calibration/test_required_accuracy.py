@@ -96,6 +96,21 @@ def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(share: float, se
     assert [one.severity for one in again.findings] == [severity]
 
 
+def test_a_change_that_moves_the_camera_is_stated_before_the_remedy_of_a_missed_accuracy():
+    """The remedy was another robot, and the limit of lines hid the warning that the mount was loose."""
+    given, _ = pairs(12, 12)
+    asked, size = CalibrateOptions(require=(1e-3, 1e-4)), {"value": 5e-3, "rotation": 0.01, "count": 6.0}
+    found = calibrate_pose_pairs(given, asked)
+    slip = Finding.of(
+        FindingKind.SLIP, "warns", "mount", *given.images[5:7], longer="after", shift=(5e-3,) * 7, **size
+    )
+    again = advised(found.with_findings(slip), given.base_from_gripper, asked)
+    (missed,) = [one for one in again.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
+    assert missed.concerns == "mount"
+    lines = [line.partition(" ")[0] for line in summary(again, 5).splitlines()]
+    assert lines.index("WARNING") < lines.index("Remedy")
+
+
 @pytest.mark.slow
 def test_the_command_ends_with_3_unless_the_accuracy_is_reached_or_none_is_required(capsys):
     given, _ = pairs(12, 12)

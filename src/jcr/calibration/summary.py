@@ -22,7 +22,7 @@ from jcr.records import GivenIntrinsicsResult, Intrinsics, LeaveOneOut, PointUnc
 
 NEGLIGIBLE = 0.02
 """Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""
-MOST_LINES = 14
+MOST_LINES, LEAST_ACTIONS = 14, 4
 """Largest number of lines of the terminal's summary, including two that the caller adds: report and next command."""
 EXTRAPOLATED = 2.0
 """Ratio of the errors in the corner and at the centre from which three quarters or more of the corner's variance are
@@ -82,7 +82,8 @@ def corner_in_words(content: AnyCalibration) -> str:
 def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     """Return the summary for the terminal: verdict, transform, accuracy and warnings, in at most `most` - 2 lines.
 
-    The caller adds the two other lines. For a rejected calibration, cause and remedy replace transform and accuracy.
+    There are more if LEAST_ACTIONS warnings and remedies need them. The caller adds the two other lines. For a rejected
+    calibration, cause and remedy replace transform and accuracy.
     """
     limit = ""
     if (required := content.requirement) is not None:
@@ -98,7 +99,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
         lines += left_out_lines(content)
     if isinstance(content, PublishedCalibration):
         lines += _published(content)
-    return "\n".join([*lines, *actions(content.findings, most - 2 - len(lines))]) + "\n"
+    return "\n".join([*lines, *actions(content.findings, max(most - 2 - len(lines), LEAST_ACTIONS))]) + "\n"
 
 
 def _result(content: Calibration) -> list[str]:
@@ -194,14 +195,19 @@ def _published(content: PublishedCalibration) -> list[str]:
 def actions(findings: Sequence[Finding], most: int) -> list[str]:
     """Return the lines with cause and remedy of a rejection, then the warnings; at most `most` lines.
 
-    `findings` are sorted (`strongest_first`). If lines are left out, the last line states their number.
+    `findings` are sorted (`strongest_first`). Faults that displace the result come before the remedy of a missed
+    accuracy, because they may be its cause. If lines are left out, the last line states their number.
     """
     findings, lines = without_consequences(findings), list[str]()
     if verdict_of(findings) == "rejected":
         cause, *others = findings
         findings = [one for one in others if cause.kind in MORE_IMAGES or one.kind not in MORE_IMAGES]
         lines = labelled("Cause", cause.text) + labelled("Remedy", *filter(None, [cause.remedy]))
-    for one in sorted(findings, key=lambda one: one.kind is not FindingKind.NOT_EXACT_ENOUGH):
+
+    def order(one: Finding) -> tuple[bool, bool]:
+        return one.shift is None or one.severity == "informs", one.kind is not FindingKind.NOT_EXACT_ENOUGH
+
+    for one in sorted(findings, key=order):
         if one.kind is FindingKind.NOT_EXACT_ENOUGH:
             # Other lines of the summary state the required and the reached accuracy.
             lines += labelled("Remedy", one.remedy)
@@ -211,7 +217,7 @@ def actions(findings: Sequence[Finding], most: int) -> list[str]:
             lines += labelled("Note", sentence(one))
     if len(lines) <= most:
         return lines
-    hidden = f"{len(lines) - most + 1} more with --verbose and in the report"
+    hidden = f"{count_of(len(lines) - most + 1, 'more line')} with --verbose and in the report"
     return [*lines[: most - 1], *labelled("", hidden)]
 
 

@@ -182,7 +182,7 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
     if stated in ("mm", "cm") and 0 < far <= METRES_LIMIT:
         raise InputError(
             f"{where}: the gripper is at most {far:.4g} {unit} from the base, too near for {unit}; these look like "
-            "metres: give --pose-units m-rad (or m-deg), or correct the unit in the column's name"
+            "metres: give --pose-units m-rad, or m-deg for angles in degrees, or correct the unit in the column's name"
         )
     several = len(position) > 1
     is_map = several and 0 < spread < METRES_LIMIT < far and per < 1
@@ -199,7 +199,7 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
     if far * per > METRES_LIMIT:
         raise InputError(
             f"{where}: the gripper is up to {far:.4g} {unit} from the base; these look like millimetres: give "
-            "--pose-units mm-rad (or mm-deg)"
+            "--pose-units mm-rad, or mm-deg for angles in degrees"
         )
     return unit
 
@@ -215,11 +215,12 @@ def angle_unit(numbers: Float[ndarray, "n k"], notation: str, stated: str | None
     largest = float(np.nanmax(np.abs(numbers), initial=0.0))
     if stated == "rad" and largest > RADIANS_LIMIT:
         raise InputError(
-            f"{where}: angles go up to {largest:.4g} rad; these look like degrees: give --pose-units m-deg (or mm-deg)"
+            f"{where}: angles go up to {largest:.4g} rad; these look like degrees: give --pose-units m-deg, "
+            "or mm-deg for positions in millimetres"
         )
     if stated == "deg" and 0 < largest < np.pi:
         raise InputError(
             f"{where}: angles are at most {largest:.3g}°, too small for a calibration; these look like radians: give "
-            "--pose-units m-rad (or mm-rad)"
+            "--pose-units m-rad, or mm-rad for positions in millimetres"
         )
     return stated or ("rad" if largest <= RADIANS_LIMIT else "deg")

@@ -29,6 +29,8 @@ from jcr.estimation.prediction import (
     predict,
     typical_camera,
 )
+from jcr.extras import xfeat_is_installed
+from jcr.features.matchers import FeatureName
 from jcr.features.sift import WORKING_SIZE_PX
 from jcr.findings import (
     Finding,
@@ -148,7 +150,8 @@ def check_capture(
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
-        found += _missed(shown, expected, found, len(counted), options)
+        if look == (hand_eye is not None):
+            found += _missed(shown, of_rows, expected, found, len(counted), options)
     if look and isinstance(capture, Capture) and verdict_of(found) != "accepted":
         found += proposed(capture, None)
     return Examination(
@@ -166,15 +169,26 @@ def check_capture(
 
 
 def _missed(
-    shown: _Comparison, expected: Uncertainty, found: list[Finding], images: int, options: CalibrateOptions
+    shown: _Comparison,
+    assumptions: Assumptions,
+    expected: Uncertainty,
+    found: list[Finding],
+    images: int,
+    options: CalibrateOptions,
 ) -> tuple[Finding, ...]:
-    """Return the finding that the expected accuracy misses the required one; empty without assumptions from images."""
-    if (assumptions := shown.assumptions) is None or (hand_eye := shown.hand_eye) is None:
-        return ()
-    # The images show the causes of the error, as they do to a run; a prediction assumes a scene.
-    of_images = replace(expected, budget=hand_eye.uncertainty.budget)
-    x, arm_known = assumptions.gripper_from_camera, hand_eye.joint_offsets is not None
-    return requirement_of(x, of_images, found, images, options, arm_known)[1]
+    """Return the finding that the expected accuracy misses the required one; empty if it is met.
+
+    `shown` has the causes of the error that the images show; without them the prediction's are taken.
+    """
+    hand_eye, arm_known = shown.hand_eye, False
+    if hand_eye is not None:
+        # The images show the causes of the error, as they do to a run; a prediction assumes a scene.
+        expected, arm_known = (
+            replace(expected, budget=hand_eye.uncertainty.budget),
+            hand_eye.joint_offsets is not None,
+        )
+    x = assumptions.gripper_from_camera
+    return requirement_of(x, expected, found, images, options, arm_known)[1]
 
 
 def _unit_doubt(move_m: float, rotation_rad: float) -> list[str]:
@@ -208,7 +222,7 @@ def _compare(
 
     The camera poses of PosePairs are given, others are reconstructed from features: first those of QUICK images of
     reduced size; then those of all images if `thorough` is set, or if the first comparison fails, is rejected or leaves
-    an image out.
+    an image out. If all images are rejected, learned features are tried, as a run does, where they are installed.
     """
     rows = np.arange(len(capture))
     if isinstance(capture, PosePairs):
@@ -219,23 +233,40 @@ def _compare(
     if not thorough:
         rows, size_px = spread_rows(len(capture)), QUICK_SIZE_PX
         tried, of_tried = replace(capture.of_rows(rows), depths=None), robot.of(rows)
+    found = _by_features(tried, rows, of_tried, options, "sift", size_px, progress)
+    # At reduced size the images may not tell which of two contradicting images is wrong.
+    is_rejected = found.hand_eye is None or verdict_of(found.hand_eye.findings) == "rejected"
+    if not thorough and (found.hand_eye is None or is_rejected or not found.hand_eye.inliers.all()):
+        return _compare(capture, robot, options, progress, thorough=True)
+    if is_rejected and xfeat_is_installed():
+        learned = _by_features(tried, rows, of_tried, options, "xfeat", size_px, progress)
+        if verdict_of(learned.findings) != "rejected":
+            return learned
+    return found
+
+
+def _by_features(
+    tried: Capture,
+    rows: Int[ndarray, " t"],
+    of_tried: RobotErrorPrior,
+    options: CalibrateOptions,
+    features: FeatureName,
+    size_px: int,
+    progress: Progress,
+) -> _Comparison:
+    """Reconstruct the images `tried`, in `rows` of the capture, by `features`, and compare their poses."""
     try:
-        made = reconstruct_colmap(tried, "sift", 0, progress, size_px)
+        made = reconstruct_colmap(tried, features, 0, progress, size_px)
     except RejectedError as error:
-        if not thorough:
-            return _compare(capture, robot, options, progress, thorough=True)
         return _Comparison(findings=no_reconstruction(error))
     case = checked_case(tried, made, options, of_tried.of(made.image_index))
     hand_eye, assumptions = case.calibration, None
     if hand_eye.converged:
-        if capture.mount == "gripper":
+        if tried.mount == "gripper":
             assumptions = assumptions_of(case)
         else:
             hand_eye = calibration_of(case)
         hand_eye = hand_eye.with_findings(*left_out_poses(tried, made, hand_eye))
-    # At reduced size the images may not tell which of two contradicting images is wrong.
-    if not thorough and (verdict_of(hand_eye.findings) == "rejected" or not hand_eye.inliers.all()):
-        return _compare(capture, robot, options, progress, thorough=True)
     return _Comparison(
         hand_eye=hand_eye,
         findings=hand_eye.findings,
