@@ -235,6 +235,8 @@ def test_buttons_take_retake_remove_undo_end_on_a_phone(chromium: Chromium, tmp_
         live._show(result=scripted.finish(), is_done=True)
         shows("document.querySelector('.verdict h2')?.innerText === 'Accepted'")
         assert chromium.js("document.querySelector('[data-press]')") is None
+        said = chromium.js("document.body.innerText").lower()
+        assert "images used" in said and "the calibration uses" in said and "images registered" not in said
         assert chromium.js("document.documentElement.scrollWidth <= innerWidth")
         for width in (390, 820, 1400):
             chromium.call(
