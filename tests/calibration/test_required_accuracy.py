@@ -109,6 +109,10 @@ def test_a_change_that_moves_the_camera_is_stated_before_the_remedy_of_a_missed_
     assert missed.concerns == "mount"
     lines = [line.partition(" ")[0] for line in summary(again, 5).splitlines()]
     assert lines.index("WARNING") < lines.index("Remedy")
+    remark = replace(slip, severity="informs", value=0.0, details={**slip.details, "rotation": 0.0})
+    again = advised(found.with_findings(remark), given.base_from_gripper, asked)
+    (missed,) = [one for one in again.findings if one.kind is FindingKind.NOT_EXACT_ENOUGH]
+    assert missed.concerns != "mount", "no warning states the change"
 
 
 @pytest.mark.slow

@@ -90,11 +90,7 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
         )
     names = [f"pose {k}" for k in range(n)] if names is None else list(names)
     known = None if scale is None else (scale, scale_std)
-    _require_possible(n, len(camera), known, robot_noise)
-    if len(names) != n:
-        raise InputError(f"names: {count_of(len(names), 'name')} for {n} poses; give one per pose")
-    if camera_errors not in get_args(CameraErrors):
-        raise InputError(f"camera_errors: {camera_errors!r:.80}; give one of {get_args(CameraErrors)}")
+    _require_possible(n, len(camera), names, known, robot_noise, camera_errors)
     far_faults(gripper[:, :3, 3], "base_from_gripper", names)
     offsets = () if offset is None else (offset_prior(*offset),)
     model = PoseModel(
@@ -110,10 +106,16 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
 def _require_possible(
     grippers: int,
     cameras: int,
+    names: Sequence[str],
     scale: tuple[float, float] | None,
     robot_noise: tuple[float, float] | None,
+    camera_errors: CameraErrors,
 ) -> None:
-    """Raise InputError unless poses are as many, and known sizes are positive, as `solve_hand_eye` needs."""
+    """Raise InputError unless poses and names are as many, and values are such, as `solve_hand_eye` needs."""
+    if len(names) != grippers:
+        raise InputError(f"names: {count_of(len(names), 'name')} for {grippers} poses; give one per pose")
+    if camera_errors not in get_args(CameraErrors):
+        raise InputError(f"camera_errors: {camera_errors!r:.80}; give one of {get_args(CameraErrors)}")
     if grippers != cameras:
         raise InputError(
             f"recon_from_camera: {cameras} camera poses for {grippers} gripper poses; give one per image"

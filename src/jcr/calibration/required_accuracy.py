@@ -102,7 +102,8 @@ def requirement_of(
     required = replace(required, more_images=more)
     main_part = None if uncertainty.budget is None else uncertainty.budget.main_part
     concerns: Concerns = "images" if more is not None else "none"
-    if more is None and any(one.shift is not None and one.kind.row.group == "order" for one in findings):
+    warned = [one for one in findings if one.severity == "warns" and one.kind.row.group == "order"]
+    if more is None and any(one.shift is not None for one in warned):
         concerns = "mount"
     elif more is None and main_part == "robot_systematic" and not arm_known:
         concerns = "robot"

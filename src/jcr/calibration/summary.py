@@ -23,7 +23,8 @@ from jcr.records import GivenIntrinsicsResult, Intrinsics, LeaveOneOut, PointUnc
 NEGLIGIBLE = 0.02
 """Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""
 MOST_LINES, LEAST_ACTIONS = 14, 4
-"""Largest number of lines of the terminal's summary, including two that the caller adds: report and next command."""
+"""Largest number of lines of the terminal's summary, including two that the caller adds, report and next command; and
+number of lines that causes, remedies and warnings may have in any case, of which the last may count those left out."""
 EXTRAPOLATED = 2.0
 """Ratio of the errors in the corner and at the centre from which three quarters or more of the corner's variance are
 due to the intrinsics; with 1.5 it is more than half, with 3 eight ninths."""

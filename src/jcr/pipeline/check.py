@@ -150,8 +150,7 @@ def check_capture(
         camera = typical_camera(capture.intrinsics, capture.image_size, capture.intrinsics_std)
         of_rows = assumptions or assumed(gripper, camera, robot_noise)
         expected = predict(of_rows, gripper, robot.of(rows).systematic)
-        if look == (hand_eye is not None):
-            found += _missed(shown, of_rows, expected, found, len(counted), options)
+        found += _missed(shown, of_rows, expected, found, len(counted), options)
     if look and isinstance(capture, Capture) and verdict_of(found) != "accepted":
         found += proposed(capture, None)
     return Examination(
@@ -176,7 +175,7 @@ def _missed(
     images: int,
     options: CalibrateOptions,
 ) -> tuple[Finding, ...]:
-    """Return the finding that the expected accuracy misses the required one; empty if it is met.
+    """Return the finding that the expected accuracy misses the required one; empty if it is met, or for a rejection.
 
     `shown` has the causes of the error that the images show; without them the prediction's are taken.
     """
