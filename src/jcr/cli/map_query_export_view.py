@@ -110,9 +110,9 @@ class ExportCommand:
             lines = [facts["line"]]
         pair = run.pair_in_words(row.contents)
         self.output.result(lines, facts | {"intrinsics": pair})
-        for sentence_of in (pair, run.root_in_words(row.contents)):
-            if sentence_of is not None:
-                sys.stderr.write(f"{sentence_of}\n")
+        for words in (pair, run.root_in_words(row.contents)):
+            if words is not None:
+                sys.stderr.write(f"{words}\n")
         if run.doubt is not None:
             warn(f"the calibration is rejected, and the file states the reason: {run.doubt}")
         elif (short := run.calibration.short) is not None:
