@@ -1,12 +1,11 @@
-"""Shares of errors inside the stated uncertainty, and predicted uncertainty.
+"""Shares of errors inside the stated uncertainty.
 
-Three simulated tables against the effective transform: poses of arms with systematic errors, points that the camera
-sees, and predicted over reported uncertainty.
+Two simulated tables against the effective transform: poses of arms with systematic errors, and points that the camera
+sees.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
-from pathlib import Path
 from typing import NamedTuple, get_args
 
 import numpy as np
@@ -16,36 +15,27 @@ from numpy import ndarray
 from benchmarks.page import number, squared_distance, table
 from benchmarks.peers import opencv
 from benchmarks.references import nine_pixels, placed
-from jcr.calibration.bundle_adjustment import adjusted
-from jcr.calibration.calibrate import calibrate_reconstruction, fitted_case
-from jcr.calibration.case import of_images
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import robot_errors
 from jcr.camera import parameters, with_parameters
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.intrinsics_prior import ESTIMATED, camera_with_prior
 from jcr.estimation.point_uncertainty import point_covariance, within_95
-from jcr.estimation.prediction import predict
 from jcr.estimation.problem import wrist_arm, wrist_problem
 from jcr.estimation.solve import recon_frame, solve, uncertainty_of
 from jcr.geometry import step_between
-from jcr.pipeline.check import assumptions_of, spread_rows
-from jcr.records import Capture, Intrinsics, Reconstruction, Uncertainty
+from jcr.records import Intrinsics
 from simulation.arms import PresetName
 from simulation.problems import INTRINSICS, BentProblem, bent_problem, error, observed
 
 COUNTS = (8, 12, 30)
-DRAWS, PREDICTED_DRAWS = 10, 20
-"""Captures per row of points, and captures of predicted uncertainty."""
+DRAWS = 10
+"""Captures per row of points."""
 POINTS, PIXEL_STD, DISTANCE_M = 400, 0.3, 0.45
 OFF = 0.005
 """Relative error of a focal length that is given wrong; its principal point is 3 px off."""
 BENT = Intrinsics(450.0, 449.0, 322.0, 236.0, 640, 480, (0.1, -0.3, 0.5, -0.4), "fisheye")
 """Camera whose distortion five coefficients of a pinhole leave by 0.2 px rms, 2 px in the corners."""
-FACTOR = 2.0
-"""Ratio of predicted and reported uncertainty that counts as agreement."""
 WHITE, PEER = "white noise alone", "OpenCV Park, scale given"
 SOLVERS: dict[str, Callable[[BentProblem], Calibration]] = {
     "joints known": lambda p: solve_hand_eye(
@@ -61,11 +51,10 @@ SOLVERS: dict[str, Callable[[BentProblem], Calibration]] = {
 
 
 def run(every: int = 1) -> str:
-    """Return the page in Markdown, of one arm and one draw in `every`: claims, then the three tables."""
+    """Return the page in Markdown, of one arm and one draw in `every`: claims, then the two tables."""
     draws = max(DRAWS // every, 1)
     robots, seen = measure_robots(ROBOT_NAMES[::every]), measure_seen(draws)
-    ahead = predicted(max(PREDICTED_DRAWS // every, 1))
-    return "\n".join([*_claims(robots, seen, ahead), *_tables(robots, seen, draws, ahead)]) + "\n"
+    return "\n".join([*_claims(robots, seen), *_tables(robots, seen, draws)]) + "\n"
 
 
 class RobotRow(NamedTuple):
@@ -209,70 +198,7 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
     return SeenRow(preset, count, known.name, within, float(np.mean(three)), *medians)
 
 
-def predicted(draws: int) -> Float[ndarray, "k 3"]:
-    """Return predicted over reported uncertainty of point, camera and rotation for accepted captures.
-
-    Captures differ in arm, its errors, number of images, intrinsics and noise.
-    """
-    ratios = []
-    for seed in range(draws):
-        capture, reconstruction = _made(seed)
-        options = CalibrateOptions()
-        robot, rows = robot_errors(capture, options), spread_rows(len(capture))
-        case = adjusted(fitted_case(capture, _only(reconstruction, rows), options, robot.of(rows)))
-        hand_eye = calibrate_reconstruction(capture, reconstruction, options)
-        if not (hand_eye.converged and case.calibration.converged):
-            continue
-        prediction = predict(assumptions_of(case), capture.base_from_gripper, robot.systematic)
-        foretold, reported = map(_bounds, (prediction, hand_eye.uncertainty))
-        ratios.append(np.divide(foretold, reported))
-    return np.reshape(ratios, (-1, 3))
-
-
-def _bounds(one: Uncertainty) -> tuple[float, float, float]:
-    """Return bounds on 95 % of the errors of a seen point (mm), and of the camera's position (mm) and rotation (°)."""
-    assert one.seen is not None
-    metres, radians = (within_95(one.covariance[part, part]) for part in (slice(0, 3), slice(3, 6)))
-    return one.seen.within_95_mm, 1e3 * metres, float(np.degrees(radians))
-
-
-def _made(seed: int) -> tuple[Capture, Reconstruction]:
-    """Return a capture without images and its reconstruction; every other one has the joints of a named arm."""
-    name, known = ROBOT_NAMES[seed % len(ROBOT_NAMES)], WAYS[seed % 3]
-    preset: PresetName = "white" if seed % 5 in (1, 4) else "typical"
-    count, rng = (6, 8, 12, 20)[seed % 4], np.random.default_rng([seed, 7])
-    problem, start = bent_problem(arm_named(name), preset, count, seed), known.start(rng)
-    capture = Capture(
-        folder=Path(),
-        images=tuple(f"{k}.png" for k in range(count)),
-        base_from_gripper=problem.base_from_gripper,
-        image_size=(start.width, start.height),
-        intrinsics=start if known.is_given else None,
-        joints=problem.joints if seed % 2 else None,
-        robot=name if seed % 2 else None,
-    )
-    return capture, Reconstruction(
-        image_index=np.arange(count),
-        recon_from_camera=problem.recon_from_camera,
-        intrinsics=start,
-        tracks=observed(problem, rng, POINTS, (0.1, 0.3)[seed // 2 % 2], known.camera),
-        backend="simulated",
-    )
-
-
-def _only(made: Reconstruction, rows: np.ndarray) -> Reconstruction:
-    return Reconstruction(
-        image_index=rows,
-        recon_from_camera=made.recon_from_camera[rows],
-        intrinsics=made.intrinsics,
-        tracks=of_images(made.tracks, np.isin(np.arange(len(made.image_index)), rows)),
-        backend=made.backend,
-    )
-
-
-def _claims(
-    robots: Sequence[RobotRow], seen: Sequence[SeenRow], ahead: Float[ndarray, "k 3"]
-) -> Iterator[str]:
+def _claims(robots: Sequence[RobotRow], seen: Sequence[SeenRow]) -> Iterator[str]:
     ours = [row for row in robots if row.known in SOLVERS and row.known != WHITE and row.accepted > 0]
     white = [row for row in robots if row.known == WHITE and row.preset != "white" and row.accepted > 0]
     # Per cent of all accepted results; all rows have as many draws.
@@ -292,16 +218,9 @@ def _claims(
         f"{np.median([row.seen_mm for row in seen]):.2f} mm, of the camera on the gripper "
         f"{np.median([row.camera_mm for row in seen]):.2f} mm."
     )
-    agree = (np.abs(np.log(ahead)) < np.log(FACTOR)).sum(0)
-    worst = np.exp(np.abs(np.log(ahead)).max(0))
-    parts = [f"{what} {n} of {len(ahead)}, at most {most:.2f} times"
-             for what, n, most in zip(("point", "camera", "rotation"), agree, worst, strict=True)]  # fmt: skip
-    yield f"> Predicted and reported uncertainty agree within a factor of {FACTOR:g}: {'; '.join(parts)}."
 
 
-def _tables(
-    robots: Sequence[RobotRow], seen: Sequence[SeenRow], draws: int, ahead: Float[ndarray, "k 3"]
-) -> Iterator[str]:
+def _tables(robots: Sequence[RobotRow], seen: Sequence[SeenRow], draws: int) -> Iterator[str]:
     yield from ("", "## Arms with systematic errors", "")
     head = "errors | images | solver | median error | accepted | > 3 σ | > 5 σ | squared distance / 6"
     yield from table(
@@ -330,13 +249,6 @@ def _tables(
             ]
             for row in seen
         ),
-    )
-    yield from ("", "## Predicted over reported uncertainty", "")
-    quantiles = np.quantile(ahead, (0.0, 0.25, 0.5, 0.75, 1.0), axis=0).T
-    names = ("point", "camera on the gripper", "rotation")
-    yield from table(
-        "95 % of errors of | least | 25 % | median | 75 % | most",
-        ([name, *map(number, row)] for name, row in zip(names, quantiles, strict=True)),
     )
 
 

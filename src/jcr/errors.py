@@ -23,11 +23,13 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return "; did you mean …?" with the known word most similar to `word`; empty if none is similar.
 
     Words are similar if their ratio of matching characters is 0.6 or more (difflib.get_close_matches), or if one is the
-    other with an underscore and more at its end.
+    other with an underscore and more at its end. The dashes of options are not compared.
     """
-    known = list(known)
-    like = get_close_matches(word.lower(), known, n=1) or [one for one in known if one.startswith(f"{word}_")]
-    return f"; did you mean {like[0]}?" if like else ""
+    plain = {one.lstrip("-"): one for one in known}
+    like = get_close_matches(word.lower().lstrip("-"), plain, n=1) or [
+        one for one in plain if one.startswith(f"{word}_")
+    ]
+    return f"; did you mean {plain[like[0]]}?" if like else ""
 
 
 def count_of(count: int, noun: str) -> str:

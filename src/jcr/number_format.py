@@ -7,6 +7,9 @@ HUGE = 1e15
 MOST_DECIMALS = 9
 """Largest number of decimals of a number with a standard deviation."""
 
+INDENT = 12
+"""Number of characters before the text of a labelled line."""
+
 
 def decimals_of(std: float) -> int:
     """Return the number of decimals for a value with this standard deviation; the last place is worth std/10 to std.
@@ -32,5 +35,5 @@ def significant(value: float, digits: int = 2) -> str:
 
 
 def labelled(label: str, *lines: str) -> list[str]:
-    """Return the lines indented by 12 characters, with `label` at the start of the first."""
-    return [f"{label if k == 0 else '':<12}{line}" for k, line in enumerate(lines)]
+    """Return the lines indented by INDENT characters, with `label` at the start of the first."""
+    return [f"{label if k == 0 else '':<{INDENT}}{line}" for k, line in enumerate(lines)]

@@ -18,7 +18,14 @@ from jcr.findings import (
     without_consequences,
 )
 from jcr.number_format import labelled, significant
-from jcr.records import GivenIntrinsicsResult, Intrinsics, LeaveOneOut, PointUncertaintyOverImage, share_of
+from jcr.records import (
+    GivenIntrinsicsResult,
+    Intrinsics,
+    LeaveOneOut,
+    PointUncertaintyOverImage,
+    Uncertainty,
+    share_of,
+)
 
 NEGLIGIBLE = 0.02
 """Ratio to the largest part of an uncertainty budget up to which a part is not printed (0.04 % of its variance)."""
@@ -28,6 +35,9 @@ number of lines that causes, remedies and warnings may have in any case, of whic
 EXTRAPOLATED = 2.0
 """Ratio of the errors in the corner and at the centre from which three quarters or more of the corner's variance are
 due to the intrinsics; with 1.5 it is more than half, with 3 eight ninths."""
+UNDETERMINED = 0.5
+"""Ratio of the error in the corner and the working distance from which the corner is not determined: an error of half of
+the distance is no measurement. The ratio is below 0.1 or above 1 in the real captures, so ± 50 % changes nothing."""
 MORE_IMAGES = {FindingKind.UNCERTAIN, FindingKind.LEAVE_ONE_OUT}
 """Kinds with the remedy "more images"; not printed if a finding of another kind rejects the calibration."""
 BACKEND_NAMES = {"colmap": "COLMAP", "dust3r": "DUSt3R", "mast3r": "MASt3R", "da3": "Depth Anything 3"}
@@ -111,12 +121,6 @@ def _result(content: Calibration) -> list[str]:
     uncertainty = content.uncertainty
     offset = " ".join(significant(size) for size in uncertainty.translation_std_mm)
     rotation = " ".join(significant(size) for size in uncertainty.rotation_std_deg)
-    accuracy = "unknown"
-    if (seen := uncertainty.seen) is not None:
-        bound = f"{significant(seen.within_95_mm)} mm, {significant(seen.rotation_95_deg)}° (95 %)"
-        accuracy = f"a point at {significant(1e-3 * seen.distance_mm)} m: {bound}"
-        if (corner := uncertainty.corner) is not None:
-            accuracy += f" at the image centre; {significant(corner.within_95_mm)} mm in the corner"
     tested = [] if content.held_out is None else [f"leave-one-out: {leave_one_out_text(content.held_out)}"]
     used = [LENGTHS[one.name] for one in content.lengths if one.used and one.name != "network"]
     sources = joined(["the robot", *used]) if used else "the robot alone"
@@ -124,16 +128,38 @@ def _result(content: Calibration) -> list[str]:
     lines = [
         *_transform(content),
         f"  1σ: {offset} mm, {rotation}°",
-        *labelled("Accuracy", accuracy, *filter(None, [corner_in_words(content)]), "; ".join(tested)),
+        *labelled(
+            "Accuracy",
+            accuracy_in_words(uncertainty),
+            *filter(None, [corner_in_words(content)]),
+            "; ".join(tested),
+        ),
     ]
     return [*lines, *(labelled("Intrinsics", *pair) if (pair := pair_in_words(content)) else ())]
 
 
-def left_out_lines(content: Calibration) -> list[str]:
-    """Return a line with up to two images that the calibration does not use, and why; empty if it uses all."""
+def accuracy_in_words(uncertainty: Uncertainty) -> str:
+    """Return the bound on 95 % of the errors of a point at the image centre and in the worst corner, in words."""
+    if (seen := uncertainty.seen) is None:
+        return "unknown"
+    bound = f"{significant(seen.within_95_mm)} mm, {significant(seen.rotation_95_deg)}° (95 %)"
+    accuracy = f"a point at {significant(1e-3 * seen.distance_mm)} m: {bound}"
+    if uncertainty.corner is None:
+        return accuracy
+    return f"{accuracy} at the image centre; {corner_bound(seen)} in the corner"
+
+
+def corner_bound(seen: PointUncertaintyOverImage) -> str:
+    """Return the bound on 95 % of the errors of a point in the worst corner, or that the corner is not determined."""
+    bound_mm = seen.corners.within_95_mm
+    return "not determined" if bound_mm > UNDETERMINED * seen.distance_mm else f"{significant(bound_mm)} mm"
+
+
+def left_out_lines(content: AnyCalibration) -> list[str]:
+    """Return lines with up to two images that the calibration does not use, and why; empty if it uses all."""
     left_out = [f"{one.image}: {one.reason}" for one in content.images if not one.used]
     more = [f"and {len(left_out) - 2} more (log.txt)"] if len(left_out) > 2 else []
-    return labelled("Left out", "; ".join([*left_out[:2], *more])) if left_out else []
+    return labelled("Left out", *left_out[:2], *more)
 
 
 def pair_in_words(content: Calibration) -> list[str]:
@@ -321,8 +347,8 @@ def seen_in_words(seen: PointUncertaintyOverImage) -> str:
     """Return a sentence with the point uncertainty (95 %, mm) across the ray, along the ray, and in an image corner."""
     return (
         f"point uncertainty: {significant(seen.lateral_95_mm)} mm across the ray and "
-        f"{significant(seen.along_95_mm)} mm along it, {significant(seen.corners.within_95_mm)} mm in a corner of the "
-        "image, with the intrinsics of this run and exact gripper poses"
+        f"{significant(seen.along_95_mm)} mm along it, {corner_bound(seen)} in a corner of the image, with the "
+        "intrinsics of this run and exact gripper poses"
     )
 
 

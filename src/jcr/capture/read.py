@@ -67,7 +67,10 @@ def read_source(
     """
     path, options = Path(path), checked_options(options, ReadOptions)
     if not path.exists():
-        raise InputError(f"{path}: no such capture; name a folder with a capture.json, or another format")
+        raise InputError(
+            f"{path}: no such capture; name a folder with a capture.json, or a file or folder of another format "
+            "(jcr docs captures)"
+        )
     if options.frames < MIN_FRAMES:
         raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed; take 5 to 15")
     if options.pose_convention != "auto":

@@ -126,7 +126,7 @@ def _dispatched(arguments: Sequence[str]) -> int:
         sys.stdout.write(_OVERVIEW.format(commands="\n\n".join(groups)))
         return 0
     name, rest = arguments[0], arguments[1:]
-    if name == "--version":
+    if name in ("--version", "version"):
         from jcr import __version__
 
         sys.stdout.write(f"jcr {__version__}\n")

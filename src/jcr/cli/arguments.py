@@ -45,6 +45,8 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
             case _ if unknown := next((word for word in options if word not in known), None):
                 owners = [f"jcr {name}" for name in COMMANDS if unknown in _flags(command(name))]
                 where = f"; it is an option of {joined(owners)}" if owners else did_you_mean(unknown, known)
+                if unknown.lstrip("-") in (positional := list(_positional(record))):
+                    where = f"; give it by its place: {program} {' '.join(map(str.upper, positional))}"
                 why = f"{program} has no option {unknown}{where}"
             case _errors.MissingArgs(missing_arguments=missing):
                 why = f"{', '.join(str(one.arg.lowered.metavar) for one in missing)}: required, and not given"
@@ -115,12 +117,20 @@ def _wrapped_paragraphs() -> Iterator[None]:
             output.write("\n".join(wrapped))
 
 
+def _positional(record: Any) -> Iterator[str]:
+    """Yield the names of the fields of a command's class that are given by their place."""
+    extra = get_type_hints(record, include_extras=True)
+    for field in fields(record):
+        if tyro.conf.Positional in getattr(extra[field.name], "__metadata__", ()):
+            yield field.name
+
+
 def _flags(record: Any) -> Iterator[str]:
     """Yield the names (--NAME) of all options of a command's class, also those of nested classes of options."""
     if is_dataclass(record):
-        hints, extra = get_type_hints(record), get_type_hints(record, include_extras=True)
+        hints, positional = get_type_hints(record), {*_positional(record)}
         for field in fields(record):
-            if tyro.conf.Positional in getattr(extra[field.name], "__metadata__", ()):
+            if field.name in positional:
                 continue
             if is_dataclass(hints[field.name]):
                 yield from _flags(hints[field.name])

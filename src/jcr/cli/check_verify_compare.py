@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy, check_options
+from jcr.backends import ReconstructOptions
+from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, VerboseOutput, numbers
+from jcr.cli.run_calibrate_batch import camera_lines, run_options
 from jcr.errors import InputError, count_of
-from jcr.findings import sentence, warnings_of
-from jcr.findings.finding import joined
+from jcr.findings import joined, sentence, warnings_of
 from jcr.number_format import labelled, significant
 from jcr.pipeline.options import TOLERANCE
 from jcr.progress import Progress, progress_bars
@@ -32,10 +33,11 @@ MOST_POSES = 5
 
 @dataclass(frozen=True, kw_only=True)
 class CheckCommand:
-    """Check a capture: files, units, motion, observability, and pose convention.
+    """Check a capture before a run: files, units, motion, pose convention, and the calibration that a run would make.
 
-    The exit status is 3 if its calibration would be rejected or not as exact as needed, or if --poses-only leaves the
-    reading of the poses undecided; the message has the reason and the remedy.
+    The options are those of `jcr calibrate`. The exit status is 3 if the calibration is rejected or not as exact as
+    needed, if another camera of the cell is rejected, or if --poses-only leaves the reading of the poses undecided; the
+    message has the reason and the remedy.
 
     for example:
       jcr check captures/table
@@ -47,56 +49,52 @@ class CheckCommand:
 
     capture: Annotated[Path, tyro.conf.Positional]
     """Folder of the capture, or another format (jcr docs captures)."""
-    read: ReadOptions = field(default_factory=ReadOptions)
     poses_only: bool = False
-    """Check files, units and motion only, without features of the images."""
-    thorough: bool = False
-    """Register all images at full size. By default 15 are, at reduced size, and all only if these show a fault."""
-    require: RequiredAccuracy = GRASPING
-    """Required accuracy of a point at the image centre, as for `jcr run`, for the comparison with the expected one."""
-    robot_noise: Annotated[tuple[float, float] | None, tyro.conf.arg(metavar="MM DEG")] = None
-    """Noise (1 sigma per axis) of the gripper poses; by default it is estimated, or 0.5 mm and 0.1°."""
+    """Check files, units and motion only; the images are not matched, and usual errors are assumed."""
     output: VerboseOutput = field(default_factory=VerboseOutput)
+    calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
+    reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
+    read: ReadOptions = field(default_factory=ReadOptions)
 
     def main(self) -> int:
         """Check the capture and print the result; return the exit status, 0 for the verdict "accepted", else 3."""
         from jcr.capture.read import read_source
         from jcr.pipeline.check import check_capture
 
-        options = CalibrateOptions(robot_noise=self.robot_noise, require=self.require)
-        check_options(options)
         # Frames of a recording are extracted to a temporary folder.
         with progress_bars() as progress, TemporaryDirectory(prefix="jcr-capture-") as scratch:
             capture = read_source(self.capture, self.read, into=scratch, progress=progress)
-            found = check_capture(
-                capture,
-                not self.poses_only,
-                options.robot_noise_m_rad,
-                progress,
-                self.thorough,
-                self.require,
-            )
+            found = check_capture(capture, not self.poses_only, run_options(self), progress=progress)
             self.output.result(_check_lines(self, found), _check_facts(found))
-        return 0 if found.verdict == "accepted" else 3
+        rejected = (
+            [] if found.cameras is None else [one for one in found.cameras.cameras if not one.converged]
+        )
+        return 0 if found.verdict == "accepted" and not rejected else 3
 
 
-def read_arguments(read: ReadOptions) -> list[str]:
-    """Return the options of reading a capture that are not at their default as command-line arguments."""
+def arguments_of(*options: Any) -> list[str]:
+    """Return the fields of option records that are not at their default as command-line arguments."""
     given = list[str]()
-    for option in fields(read):
-        value = getattr(read, option.name)
-        if value != option.default:
-            values = value if isinstance(value, tuple) else () if value is True else (value,)
-            given += [f"--{option.name.replace('_', '-')}", *map(str, values)]
+    for record in options:
+        for option in fields(record):
+            value = getattr(record, option.name)
+            if value != option.default:
+                values = value if isinstance(value, tuple) else () if value is True else (value,)
+                given += [f"--{option.name.replace('_', '-')}", *map(str, values)]
     return given
 
 
 def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
-    """Return the lines to print: verdict, causes and remedies, expected accuracy unless rejected, next command."""
-    from jcr.calibration.summary import MOST_LINES, actions, verdict_in_words
-    from jcr.capture.readings import decision_in_words
+    """Return the lines to print: verdict, causes and remedies, accuracy unless rejected, cameras, next command."""
+    from jcr.calibration.summary import (
+        LEAST_ACTIONS,
+        MOST_LINES,
+        actions,
+        left_out_lines,
+        verdict_in_words,
+    )
 
-    capture = found.capture
+    capture, made = found.capture, found.calibration
     about = f"{count_of(len(capture), 'sample')} with the poses of gripper and camera, no images"
     if not isinstance(capture, PosePairs):
         size = "x".join(map(str, capture.image_size))
@@ -104,45 +102,60 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         about = f"{count_of(len(capture), 'image')} of {size}, intrinsics {intrinsics}"
     is_rejected, closing = found.verdict == "rejected", "jcr docs troubleshooting"
     undecided = isinstance(capture, Capture) and bool(capture.candidates)
-    outcome = "a calibration would be rejected" if is_rejected else "good to calibrate"
-    if found.verdict not in ("accepted", "rejected") and command.require != "none":
-        outcome = f"a calibration would miss {command.require[0]:g} mm and {command.require[1]:g}°"
-    elif command.poses_only and not is_rejected and isinstance(capture, Capture):
-        outcome = (
-            "good to calibrate by the motion alone; whether the poses are those of the images was not checked"
-        )
+    outcome, required = "good to calibrate", command.calibrate.require
+    bad = [] if found.cameras is None else [one.name for one in found.cameras.cameras if not one.converged]
+    if is_rejected:
+        outcome = "a calibration would be rejected"
+    elif bad:
+        outcome = f"a calibration would reject {joined(bad)}"
+    elif found.verdict != "accepted" and required != "none":
+        outcome = f"a calibration would miss {required[0]:g} mm and {required[1]:g}°"
+    elif made is None:
+        outcome += " by the motion alone; whether the poses are those of the images was not checked"
     verdict = verdict_in_words(found.findings)
     if undecided and not is_rejected:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"
     lines = [f"{verdict}: {outcome}. {about}"]
-    if isinstance(capture, Capture) and capture.candidates:
-        readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
-        lines += labelled("Poses", readings, "leave out --poses-only or name the reading (--pose-convention)")
-    elif isinstance(capture, Capture) and capture.reading is not None:
-        lines += labelled("Poses", decision_in_words(capture.reading))
-    if isinstance(capture, Capture) and capture.others:
-        named = joined([one.name for one in capture.others])
-        lines += labelled("Cameras", f"{capture.camera_name} was checked; jcr run also uses {named}")
-    if isinstance(capture, Capture) and capture.mount == "base":
-        lines += labelled(
-            "Board",
-            "none was looked for; if the gripper holds one: jcr calibrate … --board (jcr docs cameras)",
-        )
+    lines += _reading_lines(command, capture)
     if is_rejected and isinstance(capture, Capture) and capture.reading is not None:
         closing = _command_of_remedy(command, found) or closing
     if not is_rejected:
         lines += [] if undecided else _motion_lines(found)
         path = command.capture
         out = f"out/{path.stem if path.is_file() else path.name}"
-        closing = shlex.join(["jcr", "run", str(path), out, *read_arguments(command.read)])
+        name = "run" if isinstance(capture, Capture) else "calibrate"
+        options = arguments_of(command.read, command.calibrate, command.reconstruct)
+        closing = shlex.join(["jcr", name, str(path), out, *options])
+    if made is not None:
+        lines += left_out_lines(made)
+    lines += camera_lines(found.cameras)
     notes = [line for note in found.notes for line in labelled("Note", note)]
-    acting = actions(found.findings, MOST_LINES - len(lines) - 1)
+    acting = actions(found.findings, max(MOST_LINES - len(lines) - 1, LEAST_ACTIONS))
     if command.output.verbose:
         acting += [f"{one.severity}: {sentence(one)}" for one in found.findings]
     else:
-        notes = notes[: MOST_LINES - len(lines) - len(acting) - 1]
+        notes = notes[: max(MOST_LINES - len(lines) - len(acting) - 1, 0)]
     lines += [*acting, *notes]
     return [*lines, *labelled("Next", closing)]
+
+
+def _reading_lines(command: CheckCommand, capture: Capture | PosePairs) -> list[str]:
+    """Return the lines on how the poses were read, and on the board of a fixed camera."""
+    from jcr.capture.readings import decision_in_words
+
+    lines = list[str]()
+    if isinstance(capture, PosePairs):
+        return lines
+    if capture.candidates:
+        readings = f"{len(capture.candidates)} readings of {capture.source} are possible; the images decide"
+        lines += labelled("Poses", readings, "leave out --poses-only or name the reading (--pose-convention)")
+    elif capture.reading is not None:
+        lines += labelled("Poses", decision_in_words(capture.reading))
+    if capture.mount == "base" and command.reconstruct.board is None:
+        lines += labelled(
+            "Board", "none was looked for; if the gripper holds one: --board (jcr docs cameras)"
+        )
+    return lines
 
 
 def _command_of_remedy(command: CheckCommand, found: "Examination") -> str:
@@ -150,48 +163,45 @@ def _command_of_remedy(command: CheckCommand, found: "Examination") -> str:
     cause = found.findings[0].details
     changes: dict[str, Any] = {"pose_inverted": True} if "pose_inverted" in cause else {}
     changes |= {name: cause[name] for name in cause.keys() & {"pose_convention"}}
-    options = read_arguments(replace(command.read, **changes))
+    options = arguments_of(replace(command.read, **changes))
     return shlex.join(["jcr", "check", str(command.capture), *options]) if changes else ""
 
 
 def _motion_lines(found: "Examination") -> list[str]:
     """Return the lines on the motion, the expected accuracy, and the agreement of poses and images."""
-    from jcr.calibration.summary import left_out_lines
+    from jcr.calibration.record import Calibration
+    from jcr.calibration.summary import accuracy_in_words
 
-    rotation, images = np.degrees(found.largest_rotation_rad), len(found.capture)
+    rotation = np.degrees(found.largest_rotation_rad)
     motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
-    lines, fitted = labelled("Motion", motion), found.hand_eye
-    if found.expected is not None and (seen := found.expected.seen) is not None:
+    lines, made = labelled("Motion", motion), found.calibration
+    if found.expected is not None and found.expected.seen is not None:
         std = found.expected.std
         offset, turn = (
             " ".join(significant(float(value)) for value in part)
             for part in (1e3 * std[:3], np.degrees(std[3:6]))
         )
+        errors = "usual errors" if made is None else "the errors found in them"
         lines += labelled(
             "Expected",
-            f"a point at {significant(1e-3 * seen.distance_mm)} m: {significant(seen.within_95_mm)} mm, "
-            f"{significant(seen.rotation_95_deg)}° (95 %) at the image centre; jcr run states the corner, too",
-            f"from {count_of(len(found.counted), 'image')}, with "
-            f"{'usual errors' if fitted is None else 'the errors found in these images'}",
+            accuracy_in_words(found.expected),
+            f"from {count_of(len(found.counted), 'image')}, with {errors}",
             f"1σ of the transform: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
         )
-    if fitted is not None:
-        noise, compared = fitted.robot_noise, images if found.compared is None else len(found.compared)
-        looked = f"{int(fitted.inliers.sum())} of {compared} images"
-        if compared < images:
-            looked += f"; --thorough compares all {images}, and tests distortion and focus"
+    if isinstance(made, Calibration):
+        noise = made.robot_noise
         agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
-        lines += labelled("Agreement", f"poses and images: {agreement} ({looked})") + left_out_lines(fitted)
+        lines += labelled("Agreement", f"poses and images: {agreement}")
     return lines
 
 
 def _check_facts(found: "Examination") -> dict[str, Any]:
     """Return what `jcr check --json` prints: verdict, images, motion, expected accuracy, findings and notes."""
-    from jcr.calibration.record import as_json, mm_and_deg
+    from jcr.calibration.record import Calibration, as_json, mm_and_deg
 
-    capture = found.capture
+    capture, made = found.capture, found.calibration
     reading = None if isinstance(capture, PosePairs) else capture.reading
-    noise = None if found.hand_eye is None else found.hand_eye.robot_noise
+    noise = made.robot_noise if isinstance(made, Calibration) else None
     seen = None if found.expected is None else found.expected.seen
     observed = ("observable", "unobservable", "advice")
     return {
@@ -206,6 +216,7 @@ def _check_facts(found: "Examination") -> dict[str, Any]:
         "expected_seen": seen and asdict(seen),
         "expected_images": [capture.images[row] for row in found.counted],
         "robot_noise": None if noise is None else mm_and_deg(noise.translation, noise.rotation),
+        "cameras": [] if found.cameras is None else found.cameras.as_json()["cameras"],
         "findings": [as_json(one) for one in found.findings],
         "warnings": warnings_of(found.findings),
         "notes": found.notes,
@@ -265,14 +276,16 @@ class CompareCommand:
         if found.likely_cause is not None:
             remedy = [f"compare first {found.likely_cause}", *remedy]
         verdict = "DIFFER" if is_contradiction else "NOT DECIDED" if found.p_value is None else "AGREE"
+        if rejected:  # what is rejected states nothing of the other
+            verdict, explained = "NOT DECIDED", f"; {joined(list(rejected))} is rejected"
+            remedy = ["remove the cause of the rejection, calibrate again, then compare"]
         apart = f"{facts['translation_mm']:.3f} mm, {facts['rotation_deg']:.4f}° apart"
         lines = [f"{verdict}: {apart}{explained}", *labelled("Remedy", *remedy)]
         lines += labelled("Difference", offset)
         shares = {name.replace("_", " "): 100 * share for name, share in found.explained_by.items()}
         causes = ", ".join(f"{name} {share:.0f} %" for name, share in shares.items() if share >= 0.5)
-        if len(shares) > 1:
-            condition = "if the errors were larger than reported: " if is_contradiction else ""
-            lines += labelled("Causes", condition + causes)
+        if len(shares) > 1 and not is_contradiction and not rejected:
+            lines += labelled("Causes", causes)
         if self.output.verbose and found.sigmas is not None:
             lines.append(f"χ² {found.chi2:.1f} of 6, p = {found.p_value:.2g}")
         lines += [line for path, why in rejected.items() for line in labelled("Rejected", f"{path}: {why}")]

@@ -2,7 +2,6 @@
 
 import sys
 import threading
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -177,10 +176,11 @@ class QueryCommand:
             lines = (_FORMATS % row for row in zip(*(column.tolist() for column in columns), strict=True))
             write_text(path, "\n".join([_CSV_COLUMNS, *lines]) + "\n")
             summary = f"wrote {path}: {summary}"
-        values = (one.tolist() for one in (sample.distance, sample.std, sample.occupancy, sample.label))
-        distance, std, occupancy, label = values
-        few = zip(x_in_base, distance, std, occupancy, label, strict=True)
-        lines = [summary, *(_answer(*one, scene.label_names) for one in islice(few, PRINTED_POINTS))]
+        labels = [scene.label_names[k] if k else "no object" for k in sample.label]
+        labels = ["unseen" if unseen else one for one, unseen in zip(labels, sample.unknown, strict=True)]
+        values = (one.tolist() for one in (sample.distance, sample.std, sample.occupancy))
+        few = islice(zip(x_in_base, *values, labels, strict=True), PRINTED_POINTS)
+        lines = [summary, *(_answer(*one) for one in few)]
         self.output.result(lines, answers)
         return 0
 
@@ -190,17 +190,14 @@ def _answer(
     distance: float,
     std: float,
     occupancy: float,
-    label: int,
-    names: Sequence[str],
+    label: str,
 ) -> str:
     """Return the map's answer at one point on one line: distance with its standard deviation, occupancy, and label."""
     at = f"({numbers(x_in_base, 3)}) m"
     if np.isnan(distance):
         return f"{at}: outside of the mapped workspace"
     error = "" if np.isnan(std) else f" ± {1e3 * std:.1f}"
-    return (
-        f"{at}: {1e3 * distance:.1f}{error} mm to the surface (1σ), occupancy {occupancy:.2f}, {names[label]}"
-    )
+    return f"{at}: {1e3 * distance:.1f}{error} mm to the surface (1σ), occupancy {occupancy:.2f}, {label}"
 
 
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
@@ -252,7 +249,8 @@ class MeasureCommand:
             f"its points within {1e3 * support.noise:.1f} mm (1 σ)"
         )
         width = max([6, *(len(size.name) for size in objects)])
-        columns = f"{'height (mm)':>14}  {'length (mm)':>14}  {'width (mm)':>14}  centre x, y (m), ± 1 σ"
+        titles = (f"{side + ' ± 1σ mm':>14}" for side in ("height", "length", "width"))
+        columns = f"{'  '.join(titles)}  centre x, y (m)"
         lines.append(f"{'object':<{width}}  {columns}" if objects else "nothing stands on it")
         for size in objects:
             sides = zip(1e3 * size.box_size, 1e3 * size.box_std, strict=True)

@@ -2,12 +2,15 @@
 
 import io
 import json
+import shutil
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from jcr.errors import printable
+from jcr.number_format import INDENT
 
 
 @dataclass(frozen=True)
@@ -21,10 +24,11 @@ class Output:
 
     def result(self, lines: Iterable[str], facts: Mapping[str, object]) -> None:
         """Print the result: with --json `facts` as one JSON object (arrays as lists), otherwise the `lines`."""
-        as_json = [json.dumps(facts, default=lambda array: array.tolist())] if self.json else []
-        shown = as_json or map(printable, lines)  # names in files must not command the terminal
-        sys.stdout.writelines(f"{line}\n" for line in shown)
-        sys.stdout.flush()
+        if self.json:
+            sys.stdout.write(json.dumps(facts, default=lambda array: array.tolist()) + "\n")
+            sys.stdout.flush()
+        else:
+            write_lines(lines)
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,24 @@ class VerboseOutput(Output):
 
     verbose: bool = False
     """Also print the details: the uncertainty budget, the use of each image, notes and p-values."""
+
+
+def write_lines(lines: Iterable[str]) -> None:
+    """Write lines to stdout; on a terminal, those longer than a row are wrapped at words, below the text of a label.
+
+    The line Next is not wrapped, because it has a command to copy; in a file or pipe no line is.
+    """
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    for line in map(printable, lines):  # names in files must not command the terminal
+        rows = [line]
+        if 0 < width < len(line) and not line.startswith("Next "):
+            is_labelled = line[INDENT - 1 : INDENT] == " " != line[INDENT : INDENT + 1]
+            indent = INDENT if is_labelled else len(line) - len(line.lstrip())
+            rows = textwrap.wrap(
+                line, width, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
+            )
+        sys.stdout.writelines(f"{row}\n" for row in rows)
+    sys.stdout.flush()
 
 
 class Quiet(io.TextIOWrapper):

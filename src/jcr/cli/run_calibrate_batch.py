@@ -13,7 +13,7 @@ import tyro
 from jcr.backends import ReconstructOptions
 from jcr.calibration.options import CalibrateOptions
 from jcr.capture.options import ReadOptions
-from jcr.cli.output import Output, VerboseOutput
+from jcr.cli.output import Output, VerboseOutput, write_lines
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError
 from jcr.files import locked
@@ -26,6 +26,7 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
+    from jcr.cell.placement import CamerasFile
     from jcr.result import RunOptions, RunResult
 
 
@@ -249,8 +250,7 @@ def show_calibration(result: "RunResult", capture: Capture | PosePairs, output: 
             lines += labelled("Poses", decision_in_words(reading))
         notes = [line for note in capture.notes for line in labelled("Note", note)]
         lines += notes[: max(most - 2 - len(lines), 0)]
-        sys.stdout.write("\n".join(lines) + "\n")
-        sys.stdout.flush()
+        write_lines(lines)
 
 
 def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
@@ -261,7 +261,7 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     Printed are other cameras, the lines `more`, the path of the report, the next command, and with --verbose the
     details. With --json the whole result is printed as one object.
     """
-    from jcr.calibration.summary import details, verdict_in_words
+    from jcr.calibration.summary import details
 
     content, cameras, out = result.calibration, result.cameras, result.out
     placed = [] if cameras is None else cameras.cameras
@@ -276,15 +276,9 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
         about = (
             "" if is_named else "FRAME is the frame of your gripper poses, such as tool0 or flange; "
         ) + "for a driver: --to-root LINK"
+        about = "if this accuracy is enough, else see Remedy; " * (content.short is not None) + about
         following = f"jcr export {shlex.quote(str(out))} ros2{name}  # {about}"
-    lines = list[str]()
-    for camera in placed:
-        about = f"REJECTED: {camera.doubt}"
-        if camera.doubt is None and (found := camera.uncertainty) is not None:
-            mm, deg = (significant(max(std)) for std in (found.translation_std_mm, found.rotation_std_deg))
-            about = f"{verdict_in_words(camera.findings)}, {camera.mount}_from_camera ±{mm} mm, {deg}°"
-            about += " (1σ, worst axis; cameras.json)"
-        lines += labelled("Camera", f"{camera.name}: {about}")
+    lines = camera_lines(cameras)
     if content.converged and (bad := [camera.name for camera in placed if not camera.converged]):
         lines += labelled(
             "Exit",
@@ -296,3 +290,17 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
     output.result(lines, facts)
     is_reached = content.converged and content.short is None
     return 0 if is_reached and all(camera.converged for camera in placed) else 3
+
+
+def camera_lines(cameras: "CamerasFile | None") -> list[str]:
+    """Return a line for each other camera of the cell: its verdict and uncertainty, or the reason of its rejection."""
+    from jcr.calibration.summary import verdict_in_words
+
+    lines = list[str]()
+    for camera in () if cameras is None else cameras.cameras:
+        about = f"REJECTED: {camera.doubt}"
+        if camera.doubt is None and (found := camera.uncertainty) is not None:
+            mm, deg = (significant(max(std)) for std in (found.translation_std_mm, found.rotation_std_deg))
+            about = f"{verdict_in_words(camera.findings)}, {camera.mount}_from_camera ±{mm} mm, {deg}° (1σ, worst axis)"
+        lines += labelled("Camera", f"{camera.name}: {about}")
+    return lines

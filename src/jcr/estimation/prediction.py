@@ -4,7 +4,7 @@ Simulated points lie on a surface with relief in front of the cameras, and all r
 depends on the scene.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -12,15 +12,15 @@ from numpy import ndarray
 
 from jcr.camera import guessed_intrinsics, parameters, project, unproject, with_parameters
 from jcr.estimation.image_equations import image_evidence
-from jcr.estimation.intrinsics_prior import CameraPrior, camera_about
+from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
-from jcr.estimation.problem import PoseModel, pose_problem, scale_prior, wrist_arm, wrist_problem
+from jcr.estimation.problem import wrist_arm, wrist_problem
 from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
-from jcr.estimation.solve import Solution, uncertainty_of, with_covariance
+from jcr.estimation.solve import uncertainty_of, with_covariance
 from jcr.geometry import Poses, Transform, nearest_to_lines, transform
 from jcr.least_squares import one_blas_thread
-from jcr.records import Intrinsics, RobotNoise, Tracks, Uncertainty
+from jcr.records import Capture, Intrinsics, RobotNoise, Tracks, Uncertainty
 
 MIN_PREDICTED_IMAGES = 3
 """Smallest number of poses for a prediction."""
@@ -32,135 +32,60 @@ RELIEF = 0.1
 """Amplitude of the scene's relief over the working distance, as of objects on a table."""
 TYPICAL_INFORMATION, TYPICAL_MODEL_ERROR = 5000.0, 1.2e-4
 """Information of an image (1/px²) and size of the remaining distortion (image widths): means of eleven captures."""
-LEAST_MODEL_ERROR = 1e-9
-"""Lower bound of the size of the remaining distortion, in image widths."""
 UNCONNECTED = 1e-2
 """Information (1/m², 1/rad²) added to all `Problem.columns`, against rounding for images without common points."""
 SAME_FEATURE = np.radians(40.0), 2.0
 """Largest angle (rad) between lines of sight, and ratio of distances, at which a feature is matched again."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PredictedCamera:
-    """Camera of a prediction: prior of its intrinsics, and information per image."""
-
-    camera: CameraPrior
-    information_per_px2: float = TYPICAL_INFORMATION
-    """Sum of the weights (1/px²) of an image's observations, mean over the images."""
-    model_error: float = TYPICAL_MODEL_ERROR
-    """Size of the remaining distortion of the camera's model, in image widths."""
-
-    @staticmethod
-    def of(solution: Solution) -> "PredictedCamera":
-        """Return the first camera of a solution, with the mean information (1/px²) and model error of its images."""
-        images, problem = solution.images, solution.problem
-        own = problem.columns.model_error[0]
-        return PredictedCamera(
-            camera=replace(problem.cameras[0], intrinsics=images.view.cameras[0]),
-            information_per_px2=float(images.weight.sum()) / problem.n_images,
-            model_error=float(images.state.model_error_std[0]) if own.stop > own.start else 0.0,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Assumptions:
-    """Assumptions of a prediction, apart from the gripper poses: hand-eye transform, distance, noise, camera, scale."""
-
-    gripper_from_camera: Float[ndarray, "4 4"]
-    distance_m: float
-    """Distance from the camera to the scene."""
-    noise: RobotNoise
-    """Errors of the gripper poses."""
-    camera: PredictedCamera | None = None
-    """Camera whose images are simulated; None: the camera poses are given and exact."""
-    scale_std: float | None = None
-    """Relative standard deviation of a known scale; None: the scale is unknown."""
-    shifts: tuple[Float[ndarray, " k"], ...] = ()
-    """Changes of the calibration that found faults explain, in COVARIANCE_ORDER and then of the intrinsics, which more
-    images do not reduce."""
-
-
-def assumed(
-    base_from_gripper: Poses, camera: PredictedCamera | None, noise: tuple[float, float] | None
-) -> Assumptions:
-    """Return assumptions before any calibration: typical robot errors, and a camera at the gripper's origin.
-
-    The recorded or planned poses `base_from_gripper` determine the axis along which the camera looks
-    (`assumed_camera`) and the median distance of the scene. `camera` None: camera poses are given and exact. `noise`
-    (m, rad) is a lower bound on the random errors of the robot; None: no bound.
-    """
-    x, sizes = assumed_camera(base_from_gripper), np.array(TYPICAL)
-    if noise is not None:
-        sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(noise)
-    metres, radians, systematic = sizes.tolist()
-    return Assumptions(
-        gripper_from_camera=x,
-        distance_m=median_distance(base_from_gripper @ x),
-        noise=RobotNoise(
-            translation=metres, rotation=radians, estimated=False, given=noise, systematic=systematic
-        ),
-        camera=camera,
-    )
-
-
-def typical_camera(
-    intrinsics: Intrinsics | None, size: tuple[int, int], std: Float[ndarray, " q"] | None = None
-) -> PredictedCamera:
-    """Return the camera of a prediction before any images are matched, with typical image information.
-
-    `intrinsics` None: guessed from `size`, the (width, height) in px. `std` are standard deviations of given
-    `intrinsics` in the order of camera.parameters; None: MEASURED.
-    """
-    camera = intrinsics or guessed_intrinsics(size)
-    return PredictedCamera(camera=camera_about(camera, intrinsics is not None, std))
-
-
 @one_blas_thread
 def predict(
-    assumptions: Assumptions, base_from_gripper: Poses, systematic: Float[ndarray, "s s"]
-) -> Uncertainty:
-    """Return the predicted uncertainty of a calibration from n gripper poses.
+    capture: Capture, noise: tuple[float, float] | None, systematic: Float[ndarray, "s s"]
+) -> tuple[Transform, Uncertainty]:
+    """Return an assumed gripper_from_camera, and the predicted uncertainty of a calibration from n images.
 
+    The camera is at the gripper's origin (`assumed_camera`), the robot's errors are typical ones, and the images have
+    typical information. `noise` (m, rad) is a lower bound on the random errors of the robot; None: no bound.
     `systematic` (6n,6n) is the covariance of the poses' systematic errors for a size σ_s of 1 rad. Its order is pose by
-    pose: translation (m), then rotation vector (rad), in base axes. The images of `assumptions.camera` are simulated.
+    pose: translation (m), then rotation vector (rad), in base axes.
     """
-    x, noise, camera = assumptions.gripper_from_camera, assumptions.noise, assumptions.camera
-    intrinsics = None
-    cameras = base_from_gripper @ x
-    if camera is None:
-        known = () if assumptions.scale_std is None else (scale_prior(1.0, assumptions.scale_std),)
-        model = PoseModel(error_covariance=systematic, noise_floor=noise.given, priors=known)
-        problem, state = pose_problem(base_from_gripper, cameras, (x, 1.0, np.eye(4)), model)
-        found = with_covariance(problem, state, None, expected=noise)
-        uncertainty = Uncertainty(covariance=found.covariance[:7, :7])
-    else:
-        # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
-        straight = parameters(camera.camera.intrinsics)
-        straight[4:] = 0.0
-        intrinsics = with_parameters(camera.camera.intrinsics, straight)
-        problem, state = wrist_problem(
-            wrist_arm(base_from_gripper, systematic),
-            (x, 1.0, np.eye(4)),
-            cameras,
-            replace(camera.camera, intrinsics=intrinsics),
-            _observed_points(cameras, intrinsics, assumptions.distance_m),
-            noise=noise.given,
-        )
-        assert problem.observations is not None
-        per_image = len(problem.observations.point) / len(cameras)
-        state = replace(
-            state,
-            model_error_std=np.array([max(camera.model_error, LEAST_MODEL_ERROR)]),
-            pixel_noise=PixelNoise(np.array([np.sqrt(per_image / camera.information_per_px2)])),
-        )
-        images = image_evidence(problem, state)
-        images.information[np.diag_indices(len(images.information))] += UNCONNECTED
-        found = with_covariance(problem, state, images, expected=noise)
-        uncertainty, intrinsics = uncertainty_of(found), found.problem.intrinsics(found.state)[0]
-    for shift in assumptions.shifts:
-        shift = shift if uncertainty.joint is not None else shift[:7]
-        uncertainty = uncertainty.with_error(np.outer(shift, shift))
-    return replace(uncertainty, seen=seen_points(x, uncertainty, intrinsics, assumptions.distance_m))
+    gripper, sizes = capture.base_from_gripper, np.array(TYPICAL)
+    if noise is not None:
+        sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(noise)
+    metres, radians, systematic_rad = sizes.tolist()
+    expected = RobotNoise(
+        translation=metres, rotation=radians, estimated=False, given=noise, systematic=systematic_rad
+    )
+    intrinsics = capture.intrinsics or guessed_intrinsics(capture.image_size)
+    # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
+    straight = parameters(intrinsics)
+    straight[4:] = 0.0
+    prior = camera_about(intrinsics, capture.intrinsics is not None, capture.intrinsics_std)
+    prior = replace(prior, intrinsics=with_parameters(intrinsics, straight))
+    x = assumed_camera(gripper)
+    cameras = gripper @ x
+    distance_m = median_distance(cameras)
+    problem, state = wrist_problem(
+        wrist_arm(gripper, systematic),
+        (x, 1.0, np.eye(4)),
+        cameras,
+        prior,
+        _observed_points(cameras, prior.intrinsics, distance_m),
+        noise=noise,
+    )
+    assert problem.observations is not None
+    per_image = len(problem.observations.point) / len(cameras)
+    state = replace(
+        state,
+        model_error_std=np.array([TYPICAL_MODEL_ERROR]),
+        pixel_noise=PixelNoise(np.array([np.sqrt(per_image / TYPICAL_INFORMATION)])),
+    )
+    images = image_evidence(problem, state)
+    images.information[np.diag_indices(len(images.information))] += UNCONNECTED
+    found = with_covariance(problem, state, images, expected=expected)
+    uncertainty = uncertainty_of(found)
+    seen = seen_points(x, uncertainty, found.problem.intrinsics(found.state)[0], distance_m)
+    return x, replace(uncertainty, seen=seen)
 
 
 def _observed_points(cameras: Poses, intrinsics: Intrinsics, distance_m: float) -> Tracks:

@@ -3,7 +3,13 @@
 from collections.abc import Iterator
 
 from jcr.calibration.record import AnyCalibration, Calibration, PublishedCalibration
-from jcr.calibration.summary import corner_in_words, corner_is_missed, leave_one_out_text, worst_direction
+from jcr.calibration.summary import (
+    corner_bound,
+    corner_in_words,
+    corner_is_missed,
+    leave_one_out_text,
+    worst_direction,
+)
 from jcr.findings import FindingKind, reached_in_words, sentence
 from jcr.number_format import significant
 from jcr.report.render import Content
@@ -75,9 +81,9 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
     """Yield tiles (a number in a box) of the accuracy of a point at the image centre and corner, used images, and scale.
 
     Tiles whose numbers the calibration does not have are left out; without the corner, the rotation uncertainty of the
-    camera is given.
+    camera is given. A rejected calibration has no accuracy.
     """
-    uncertainty = calibration.uncertainty
+    uncertainty = calibration.uncertainty if calibration.converged else None
     if uncertainty is not None and (seen := uncertainty.seen) is not None:
         far, turned = significant(1e-3 * seen.distance_mm), significant(seen.rotation_95_deg)
         bound, kind = (
@@ -85,12 +91,13 @@ def _tiles(calibration: AnyCalibration) -> Iterator[Tile]:
             "first" + " missed" * (calibration.short is not None),
         )
         yield "Point at the image centre", bound, f"at {far} m, {turned}°; 95 %", kind
-        bound, degrees = (
-            f"{significant(seen.corners.within_95_mm)} mm",
-            significant(seen.corners.rotation_95_deg),
+        bound, kind = corner_bound(seen), "first missed" if corner_is_missed(calibration) else "first"
+        about = (
+            f"{significant(seen.corners.rotation_95_deg)}°; 95 %"
+            if bound[0].isdigit()
+            else "no features near it"
         )
-        kind = "first missed" if corner_is_missed(calibration) else "first"
-        yield "Point in the image corner", bound, f"{degrees}°; 95 %", kind
+        yield "Point in the image corner", bound, about, kind
     elif uncertainty is not None:
         degrees = significant(max(uncertainty.rotation_std_deg))
         yield "Rotation of the camera", f"±{degrees}°", "1 σ, worst axis", "first"

@@ -204,6 +204,8 @@ def read_cloud(path: Path) -> PointCloud:
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
     except OSError as error:
-        raise InputError(f"{path}: no cloud here ({error.strerror}); make one with jcr map OUT") from None
+        raise InputError(
+            f"{path}: no map here ({error.strerror}); name the folder of a run, and make its map with jcr map OUT"
+        ) from None
     except (ValueError, IndexError):
         raise InputError(f"{path}: is no cloud of jcr, or damaged; run jcr map OUT again") from None

@@ -1,4 +1,4 @@
-"""Check of the reported gripper poses of images that a calibration does not use: exchanged or contradicted poses."""
+"""Check of the reported gripper poses of images that a calibration does not use: exchanged poses, or all moved alike."""
 
 import numpy as np
 from jaxtyping import Int
@@ -39,7 +39,7 @@ def check_pairing(case: Case) -> Case:
         return case
     # Bundle adjustment moves the cameras of wrong gripper poses towards these poses; the fit to camera poses does not.
     found = left_out_poses(case.capture, case.reconstruction, case.fit)
-    return case.found(*(one for one in found if one.kind is not FindingKind.POSE_CONTRADICTS_IMAGE))
+    return case.found(*found)
 
 
 def _step_beyond_half(case: Case) -> list[Finding]:
@@ -63,7 +63,7 @@ def _step_beyond_half(case: Case) -> list[Finding]:
 def left_out_poses(
     capture: Capture, made: Reconstruction, hand_eye: Calibration, used: Int[ndarray, " u"] | None = None
 ) -> tuple[Finding, ...]:
-    """Return findings about unused images whose gripper poses are exchanged, all moved, or contradicted by the image.
+    """Return findings about unused images whose gripper poses are exchanged, or all moved alike.
 
     Unused images without a camera pose in `made` are registered by their features alone. Camera pose and hand-eye
     transform then give the true gripper pose. A reported pose is contradicted if it differs from the true one by more
@@ -71,8 +71,7 @@ def left_out_poses(
     if two or more images show poses that are reported for other unused images. All other contradicted poses give one
     finding if they are moved alike (`_one_step`). Images that cannot be registered give no finding.
     """
-    metres, radians, belongs_to = dict[int, float](), dict[int, float](), dict[int, int]()
-    shows = dict[int, Transform]()
+    shows, belongs_to = dict[int, Transform](), dict[int, int]()
     calibrated = set(made.image_index[hand_eye.inliers if used is None else used].tolist())
     camera = dict(zip(made.image_index.tolist(), made.recon_from_camera, strict=True))
     unseen = [row for row in range(len(capture)) if row not in camera]
@@ -96,7 +95,6 @@ def left_out_poses(
         if (by[row] < SAME).all():
             right.add(row)
             continue
-        metres[row], radians[row] = by[row].tolist()
         shows[row] = pose
         distance = by @ (1.0, ARM)
         if distance.min() < NEARER * distance[row]:
@@ -110,10 +108,6 @@ def left_out_poses(
     moved = {row: pose for row, pose in sorted(shows.items()) if row not in exchanged}
     if capture.mount == "gripper" and (step := _one_step(capture, moved)) is not None:
         return *findings, step
-    for row in moved:
-        off = {"value": metres[row], "rotation": radians[row]}
-        image = capture.images[row]
-        findings.append(Finding.of(FindingKind.POSE_CONTRADICTS_IMAGE, "warns", "poses", image, **off))
     return tuple(findings)
 
 
