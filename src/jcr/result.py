@@ -273,6 +273,6 @@ class RunResult:
 def load_run(out: str | Path) -> RunResult:
     """Return the result of the run in the folder `out`; raise InputError if calibration.json is missing or damaged.
 
-    A rejected result is returned, too, with its matrix: look at `accepted` before you use it.
+    A rejected result is returned, too, with its matrix: look at `converged` before you use it.
     """
     return RunResult(out, calibration=read_calibration(Path(out)))

@@ -47,8 +47,8 @@ def likely_cause(
         if (found := _other_intrinsics(own, known, along, covariance)) is not None:
             fx, cx, cy = found
             return (
-                f"the intrinsics: fx {fx:.1f} cx {cx:.1f} cy {cy:.1f} for the other, instead of "
-                f"{own.intrinsics.fx:.1f} {own.intrinsics.cx:.1f} {own.intrinsics.cy:.1f}, explain the difference; "
+                f"the intrinsics: those of the other (fx {fx:.1f} cx {cx:.1f} cy {cy:.1f}) instead of "
+                f"{own.intrinsics.fx:.1f} {own.intrinsics.cx:.1f} {own.intrinsics.cy:.1f} explain the difference; "
                 "compare calibrations with the same ones (jcr export --intrinsics given)"
             )
     whole = float(motion_length(inverse(ours) @ theirs))
