@@ -46,7 +46,8 @@ def progress_bars() -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     tasks: dict[str, TaskID] = {}
-    bars = Progress(*columns, console=Console(file=sys.stderr))
+    # Finished bars disappear, because they would stand between two parts of the result.
+    bars = Progress(*columns, console=Console(file=sys.stderr), transient=True)
 
     def report(stage: str, fraction: float) -> None:
         """Draw the bar of a stage at the finished fraction, 0 to 1."""

@@ -108,7 +108,7 @@ def test_other_intrinsics_are_named_where_they_explain_a_difference_and_a_slip_i
     moved = retract(ours.gripper_from_camera, by @ off)
     found = compare(ours, moved)
     assert found.p_value is not None and found.p_value < 1e-3 and found.likely_cause is not None
-    assert f"the intrinsics: fx {ours.intrinsics.fx + 6:.1f}" in found.likely_cause
+    assert f"the intrinsics: those of the other (fx {ours.intrinsics.fx + 6:.1f}" in found.likely_cause
     other = replace(ours, on_gripper=moved, intrinsics=replace(ours.intrinsics, fx=ours.intrinsics.fx + 1))
     assert compare(ours, other).likely_cause is None, (
         "the intrinsics of the other are known, and do not explain it"

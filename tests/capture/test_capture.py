@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 import jcr
+from in_process import run_jcr
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png, read_image
 from jcr.geometry import scale_translation
@@ -54,6 +55,16 @@ def change_poses(folder: Path, change, rows=(1,)) -> None:
 def test_a_folder_of_captures_is_refused(capture: Path):
     with refused(f"holds captures, not images; did you mean {capture}"):
         jcr.read_capture(capture.parent)
+
+
+def test_options_that_a_capture_json_states_itself_are_refused_and_so_is_the_capture_as_out(capture: Path):
+    """They were ignored in silence, and the results were written among the files of the capture."""
+    for option in ("--camera-info", "--poses", "--pose-units", "--mount"):
+        value = {"--pose-units": "mm-deg", "--mount": "base"}.get(option, "nowhere.yaml")
+        done = run_jcr("check", capture, option, value)
+        assert done.returncode == 2 and f"and {option} would change them" in done.stderr
+    done = run_jcr("calibrate", capture, capture)
+    assert done.returncode == 2 and "is a capture, and the results need a folder of their own" in done.stderr
 
 
 def test_a_sound_capture_is_read_as_it_is(capture: Path):

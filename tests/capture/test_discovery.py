@@ -18,12 +18,13 @@ from jcr.capture.documents import Table
 from jcr.capture.notations import numbers_of
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import readings_of
+from jcr.errors import RejectedError
 from jcr.estimation.pose_misfit import Misfit, pose_misfit
 from jcr.geometry import inverse, transform
-from jcr.pipeline.reading_decision import decide
-from jcr.records import Capture
+from jcr.pipeline.reading_decision import decide, decided_by_images
+from jcr.records import Capture, Reconstruction
 from refusal import refused
-from scenes import capture_of
+from scenes import capture_of, reconstruction_of
 from simulation.layouts import LAYOUTS, Layout
 from simulation.problems import HandEyeProblem, hand_eye_problem
 from simulation.recordings import simulated_recordings
@@ -149,6 +150,45 @@ def test_images_without_a_camera_pose_do_not_change_the_reading():
     rows = np.array([0, 1, 3, 4, 5, 7, 8, 10, 11])
     got = decided(undecided(PROBLEM.base_from_gripper, "euler:ZYZ"), rows=rows)
     assert got.reading is not None and got.reading.notation == "euler:ZYZ" and len(got) == 12
+
+
+def test_a_camera_beside_the_robot_is_read_from_a_plain_folder(tmp_path: Path):
+    """Seen from what the gripper carries, it moves by the inverse poses; before, every reading was refused."""
+    poses = inverse(PROBLEM.base_from_gripper)
+    fixed = replace(undecided(poses, "euler:ZYX"), mount="base")
+    got = decided(fixed)
+    assert got.reading is not None and got.reading.notation == "euler:ZYX" and not got.reading.inverted
+    assert got.mount == "base" and not got.candidates
+    np.testing.assert_allclose(got.base_from_gripper, poses, atol=1e-9)
+    inverted = replace(undecided(PROBLEM.base_from_gripper, "quat:xyzw"), mount="base")
+    assert decided(inverted).base_from_gripper == pytest.approx(poses, abs=1e-9)
+    without = decided(undecided(poses, "euler:ZYX"))  # the same equations as of a camera on the gripper
+    assert without.reading is not None and without.reading.inverted and "--mount base" in without.notes[-1]
+    write(draw(tmp_path) / "p.csv", [f"{HEADER},image", *NAMED_ROWS])
+    assert jcr.read_capture(tmp_path, ReadOptions(mount="base")).mount == "base"
+
+
+def test_what_decides_the_reading_is_not_lost_for_the_run(monkeypatch: pytest.MonkeyPatch):
+    """A board was dropped in silence where the images decided the reading, and wrong intrinsics were not tested."""
+    made = reconstruction_of(PROBLEM.recon_from_camera)
+    capture, tried = undecided(PROBLEM.base_from_gripper, "euler:ZYX"), list[str]()
+
+    def alone(one: Capture, *_: object) -> Reconstruction:
+        tried.append("free" if one.intrinsics is None else "given")
+        if one.intrinsics is not None:
+            raise RejectedError("registered 0 of 12 images")
+        return made
+
+    monkeypatch.setattr("jcr.sfm.colmap.reconstruct_alone", alone)
+    monkeypatch.setattr("jcr.boards.marker.reconstruct_marker", lambda *_: tried.append("board") or made)
+    found, kept = decided_by_images(capture)
+    assert kept is made and tried == ["free"] and found.reading is not None
+    tried.clear()
+    given = replace(capture, intrinsics=made.intrinsics)
+    found, kept = decided_by_images(given)
+    assert kept is None and tried == ["given", "free"] and found.intrinsics == made.intrinsics
+    tried.clear()
+    assert decided_by_images(capture, "chessboard:9x6:0.025")[1] is None and tried == ["board"]
 
 
 def test_some_images_of_an_undecided_capture_keep_their_own_poses():

@@ -25,11 +25,12 @@ from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation, transform
 from jcr.live.session import SessionOptions
 from jcr.pipeline import run
-from jcr.records import Requirement
+from jcr.records import Reading, Requirement
 from jcr.scene.cloud import read_cloud
 from jcr.scene.options import MapOptions
 from places import ROOT
 from refusal import refused
+from scenes import capture_of
 from simulation.problems import hand_eye_problem
 
 
@@ -241,7 +242,9 @@ def test_a_rejected_check_prints_the_command_with_the_option_that_reads_the_pose
     read = {"pose_convention": "euler:xyz", "pose_inverted": 1.0}
     cause = Finding.of(FindingKind.POSE_CONVENTION, "rejects", "poses", value=0.0, **details, **read)
     command: Any = CheckCommand(capture=Path("c"))
-    found: Any = SimpleNamespace(findings=(cause,))
+    read_from = Reading(file="p.csv", decided_by="names")
+    capture = capture_of(np.tile(np.eye(4), (3, 1, 1)), reading=read_from)
+    found: Any = SimpleNamespace(findings=(cause,), capture=capture)
     expected = "jcr check c --pose-convention euler:xyz --pose-inverted"
     assert _command_of_remedy(command, found) == expected
 

@@ -27,7 +27,6 @@ def test_check_expects_what_the_run_reports(tabletop, done):
     assert found["verdict"] == ran.verdict == "accepted"
     np.testing.assert_allclose(found["expected_std"], ran.uncertainty.std, rtol=1e-6)
     assert found["expected_images"] == [one.image for one in ran.images if one.used]
-    assert run_jcr("check", tabletop, "--quiet").stdout.startswith("ACCEPTED: good to calibrate")
 
 
 def test_what_is_not_known_of_the_camera_is_in_the_expectation():
@@ -55,5 +54,5 @@ def test_samples_of_a_marker_expect_their_calibration_and_follow_the_requirement
         == "accepted, but not as exact as needed"
     )
     missed = run_jcr("check", samples, "--require", "0.01", "1")
-    assert missed.returncode == 3 and "a calibration would miss 0.01 mm and 1°" in missed.stdout
+    assert missed.returncode == 3 and "a calibration would not reach 0.01 mm and 1°" in missed.stdout
     assert run_jcr("check", samples, "--require", "none").returncode == 0

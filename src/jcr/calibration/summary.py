@@ -39,8 +39,6 @@ UNDETERMINED = 0.5
 """Ratio of the error in the corner and the working distance from which the corner is not determined: an error of half of
 the distance is no measurement. It is at most 0.13 in twelve of fourteen real captures and above 2.5 in the other two, so
 ± 50 % changes nothing."""
-MORE_IMAGES = {FindingKind.UNCERTAIN, FindingKind.LEAVE_ONE_OUT}
-"""Kinds with the remedy "more images"; not printed if a finding of another kind rejects the calibration."""
 BACKEND_NAMES = {"colmap": "COLMAP", "dust3r": "DUSt3R", "mast3r": "MASt3R", "da3": "Depth Anything 3"}
 PARTS = {
     "random robot errors": "robot_random",
@@ -108,6 +106,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)
+    if isinstance(content, Calibration):
         lines += left_out_lines(content)
     if isinstance(content, PublishedCalibration):
         lines += _published(content)
@@ -159,7 +158,7 @@ def corner_bound(seen: PointUncertaintyOverImage) -> str:
 def left_out_lines(content: AnyCalibration) -> list[str]:
     """Return lines with up to two images that the calibration does not use, and why; empty if it uses all."""
     left_out = [f"{one.image}: {one.reason}" for one in content.images if not one.used]
-    more = [f"and {len(left_out) - 2} more (log.txt)"] if len(left_out) > 2 else []
+    more = [f"and {len(left_out) - 2} more (--verbose)"] if len(left_out) > 2 else []
     return labelled("Left out", *left_out[:2], *more)
 
 
@@ -228,8 +227,7 @@ def actions(findings: Sequence[Finding], most: int) -> list[str]:
     """
     findings, lines = without_consequences(findings), list[str]()
     if verdict_of(findings) == "rejected":
-        cause, *others = findings
-        findings = [one for one in others if cause.kind in MORE_IMAGES or one.kind not in MORE_IMAGES]
+        cause, *findings = findings
         lines = labelled("Cause", cause.text) + labelled("Remedy", *filter(None, [cause.remedy]))
 
     def order(one: Finding) -> tuple[bool, bool]:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jcr.errors import InputError
+from jcr.records.capture import Mount
 
 MIN_FRAMES = 3
 """Smallest number of frames that can be calibrated."""
@@ -36,6 +37,9 @@ class ReadOptions:
     """First part of the names of the columns with the gripper poses, if a file has several poses."""
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File with the intrinsics (OpenCV, ROS, Kalibr, RealSense, COLMAP, a 3x3 matrix); by default the capture's."""
+    mount: Mount = "gripper"
+    """Body that the camera is mounted on: the gripper, or the base, which is beside the robot with the gripper in view. A
+    capture.json states it itself."""
     format: FormatName = "auto"
     """Format of the capture, if its files do not show it (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15

@@ -5,7 +5,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from jcr.capture import folder as folders
 from jcr.capture import marker_samples
@@ -15,11 +15,13 @@ from jcr.capture.formats import bag, capture_json, lerobot
 from jcr.capture.notations import notation_of
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.errors import InputError, first_few
+from jcr.findings.finding import joined
 from jcr.geometry import inverse
 from jcr.options import checked_options
 from jcr.progress import Progress, silent
 from jcr.records import Capture, PosePairs, Reading
 
+Read = TypeVar("Read", Capture, PosePairs)
 READERS: dict[str, Any] = {
     "capture": capture_json,
     "bag": bag,
@@ -30,6 +32,8 @@ READERS: dict[str, Any] = {
 """Reader module of each format, in the order in which the formats are tested."""
 RECORDINGS = ("bag", "lerobot")
 """Formats whose images are stored inside a file and are extracted on reading."""
+STATED = ("pose_convention", "pose_units", "poses", "pose_columns", "camera_info", "mount", "urdf")
+"""Options of reading whose values a capture.json states itself."""
 
 
 def read_capture(
@@ -76,6 +80,8 @@ def read_source(
     if options.pose_convention != "auto":
         notation_of(options.pose_convention)  # a wrong name is an error, also for formats that do not need it
     name = format_of(path) if options.format == "auto" else options.format
+    if name == "capture":
+        _require_unset(path, options)
     if name not in RECORDINGS:
         folder, origin, found = None, [], READERS[name].read(path, options)
     elif into is None:
@@ -87,12 +93,7 @@ def read_source(
         if extra.get("made_from") == origin:
             return replace(capture_json.read(folder), notes=tuple(extra["notes"]))
         found = READERS[name].read(path, options, folder, progress)
-    is_unread = isinstance(found, Capture) and found.reading is None and not found.candidates
-    if options.pose_inverted and is_unread:
-        read = Reading(file=path.name, inverted=True, decided_by="option")
-        found = replace(found, base_from_gripper=inverse(found.base_from_gripper), reading=read)
-    names = {"base": options.base_frame, "gripper": options.gripper_frame}
-    found = replace(found, frame_names=found.frame_names.replaced(**names))
+    found = _as_asked(found, path, options)
     if folder is not None:
         capture_json.write(folder, found, notes=found.notes, made_from=origin)
         return replace(capture_json.read(folder), notes=found.notes)
@@ -100,6 +101,32 @@ def read_source(
     if isinstance(found, PosePairs) or not found.candidates:
         require_motion(found.base_from_gripper, str(path))
     return found
+
+
+def _as_asked(found: Read, path: Path, options: ReadOptions) -> Read:
+    """Return what was read at a path with the inverted poses, the mount and the names of frames of the options."""
+    is_unread = isinstance(found, Capture) and found.reading is None and not found.candidates
+    if options.pose_inverted and is_unread:
+        read = Reading(file=path.name, inverted=True, decided_by="option")
+        found = replace(found, base_from_gripper=inverse(found.base_from_gripper), reading=read)
+    if options.mount == "base":
+        if isinstance(found, PosePairs):
+            raise InputError(f"--mount base: is for images; {path} has poses of a marker alone; leave it out")
+        found = replace(found, mount="base")
+    names = {"base": options.base_frame, "gripper": options.gripper_frame}
+    return replace(found, frame_names=found.frame_names.replaced(**names))
+
+
+def _require_unset(path: Path, options: ReadOptions) -> None:
+    """Raise InputError if an option is set whose value a capture.json states itself."""
+    default = ReadOptions()
+    given = [name for name in STATED if getattr(options, name) != getattr(default, name)]
+    if given:
+        flags = joined([f"--{name.replace('_', '-')}" for name in given])
+        raise InputError(
+            f"{path}: its capture.json states poses, intrinsics and mount itself, and {flags} would change them; "
+            "correct capture.json, or leave the option out (jcr docs captures)"
+        )
 
 
 def format_of(path: Path) -> str:

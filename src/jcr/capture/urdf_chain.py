@@ -39,7 +39,11 @@ def load_urdf(file: Path) -> "yourdfpy.URDF":
             where, axis = f"{file}: joint {joint.name}", np.asarray(joint.axis, float)
             if joint.origin is not None:
                 require_rigid(np.reshape(joint.origin, (4, 4)), f"{where}: origin")
-            if not (axis.shape == (3,) and np.isfinite([*axis, *_limits(joint)]).all() and axis.any()):
+            if not (
+                axis.shape == (3,)
+                and np.isfinite([*axis, *_limits(joint)]).all()
+                and (axis.any() or joint.type == "fixed")
+            ):
                 what = "its axis is no direction, or its limits are not finite; correct them there"
                 raise InputError(f"{where}: {what}")
             joints_to(plain, joint.child)

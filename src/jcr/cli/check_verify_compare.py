@@ -90,6 +90,7 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         LEAST_ACTIONS,
         MOST_LINES,
         actions,
+        details,
         left_out_lines,
         verdict_in_words,
     )
@@ -106,10 +107,10 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     bad = [] if found.cameras is None else [one.name for one in found.cameras.cameras if not one.converged]
     if is_rejected:
         outcome = "a calibration would be rejected"
-    elif bad:
-        outcome = f"a calibration would reject {joined(bad)}"
+    elif bad and isinstance(capture, Capture):
+        outcome = f"{capture.camera_name} is good to calibrate, but {joined(bad)} would be rejected"
     elif found.verdict != "accepted" and required != "none":
-        outcome = f"a calibration would miss {required[0]:g} mm and {required[1]:g}°"
+        outcome = f"a calibration would not reach {required[0]:g} mm and {required[1]:g}°"
     elif made is None:
         outcome += " by the motion alone; whether the poses are those of the images was not checked"
     verdict = verdict_in_words(found.findings)
@@ -117,12 +118,12 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         verdict, outcome = "NOT DECIDED", "neither names nor options say how the poses are written"
     lines = [f"{verdict}: {outcome}. {about}"]
     lines += _reading_lines(command, capture)
-    if is_rejected and isinstance(capture, Capture) and capture.reading is not None:
+    if is_rejected and isinstance(capture, Capture):
         closing = _command_of_remedy(command, found) or closing
     if not is_rejected:
         lines += [] if undecided else _motion_lines(found)
         path = command.capture
-        out = f"out/{path.stem if path.is_file() else path.name}"
+        out = f"out/{path.stem if path.is_file() else path.resolve().name}"
         name = "run" if isinstance(capture, Capture) else "calibrate"
         options = arguments_of(command.read, command.calibrate, command.reconstruct)
         closing = shlex.join(["jcr", name, str(path), out, *options])
@@ -132,7 +133,9 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
     notes = [line for note in found.notes for line in labelled("Note", note)]
     acting = actions(found.findings, max(MOST_LINES - len(lines) - 1, LEAST_ACTIONS))
     if command.output.verbose:
-        acting += [f"{one.severity}: {sentence(one)}" for one in found.findings]
+        acting += (
+            [f"{one.severity}: {sentence(one)}" for one in found.findings] if made is None else details(made)
+        )
     else:
         notes = notes[: max(MOST_LINES - len(lines) - len(acting) - 1, 0)]
     lines += [*acting, *notes]
@@ -162,7 +165,9 @@ def _command_of_remedy(command: CheckCommand, found: "Examination") -> str:
     """Return the command that checks a file with the options that its cause names; empty if it names none."""
     cause = found.findings[0].details
     changes: dict[str, Any] = {"pose_inverted": True} if "pose_inverted" in cause else {}
-    changes |= {name: cause[name] for name in cause.keys() & {"pose_convention"}}
+    capture = found.capture
+    if isinstance(capture, Capture) and capture.reading is not None:  # a capture.json has one convention
+        changes |= {name: cause[name] for name in cause.keys() & {"pose_convention"}}
     options = arguments_of(replace(command.read, **changes))
     return shlex.join(["jcr", "check", str(command.capture), *options]) if changes else ""
 
@@ -181,11 +186,11 @@ def _motion_lines(found: "Examination") -> list[str]:
             " ".join(significant(float(value)) for value in part)
             for part in (1e3 * std[:3], np.degrees(std[3:6]))
         )
-        errors = "usual errors" if made is None else "the errors found in them"
+        errors = "assumed: the distance and usual errors" if made is None else "with the errors found in them"
         lines += labelled(
             "Expected",
             accuracy_in_words(found.expected),
-            f"from {count_of(len(found.counted), 'image')}, with {errors}",
+            f"from {count_of(len(found.counted), 'image')}, {errors}",
             f"1σ of the transform: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
         )
     if isinstance(made, Calibration):

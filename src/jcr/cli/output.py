@@ -42,12 +42,14 @@ class VerboseOutput(Output):
 def write_lines(lines: Iterable[str]) -> None:
     """Write lines to stdout; on a terminal, those longer than a row are wrapped at words, below the text of a label.
 
-    The line Next is not wrapped, because it has a command to copy; in a file or pipe no line is.
+    Commands to copy (the line Next, and lines in lower case) are not wrapped; in a file or pipe no line is.
     """
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 0
+    # While progress bars are drawn, stdout is a proxy of rich, which does not tell whether it is a terminal.
+    stream = getattr(sys.stdout, "rich_proxied_file", sys.stdout)
+    width = shutil.get_terminal_size().columns if stream.isatty() else 0
     for line in map(printable, lines):  # names in files must not command the terminal
         rows = [line]
-        if 0 < width < len(line) and not line.startswith("Next "):
+        if 0 < width < len(line) and not (line.startswith("Next ") or line[:1].islower()):
             is_labelled = line[INDENT - 1 : INDENT] == " " != line[INDENT : INDENT + 1]
             indent = INDENT if is_labelled else len(line) - len(line.lstrip())
             rows = textwrap.wrap(

@@ -176,6 +176,11 @@ class Solution:
             covariance[i] = own + by @ solution.covariance @ by.T
         return found, covariance
 
+    @property
+    def is_astray(self) -> bool:
+        """Whether the rounds ended because their steps stayed large, so that no minimum is near."""
+        return not self.settled and self.last_step > ASTRAY
+
     def camera_unknowns(self, columns: slice) -> slice:
         """Return the slice of the p unknowns for a slice of `Problem.columns` (cameras, model errors or boards)."""
         first = self.problem.arm_unknowns

@@ -178,8 +178,10 @@ def _into_robot(file: Path, mount: CameraMount) -> str:
     """
     try:
         text = read_bytes(file).decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: not UTF-8 text ({error}); name the URDF or xacro of a robot") from None
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror}; name the URDF or xacro of a robot") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{file}: not UTF-8 text; name the URDF or xacro of a robot") from None
     # Comments keep their place and length, so that places are those of the text.
     plain = _XML_COMMENT.sub(lambda found: " " * len(found[0]), text)
     joints = {found: _links_of(found[0]) for found in _JOINT.finditer(plain)}

@@ -1,10 +1,12 @@
 """Decision between readings of gripper poses by the images: camera poses without the robot, misfit of each reading."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations, islice
 from math import comb
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from jcr.capture.folder import count_differs
 from jcr.capture.options import tolerated
 from jcr.capture.pairing import LARGEST_SHIFT, other_orders
 from jcr.capture.readings import text_of, undecided
+from jcr.cell.moving_parts import with_moving_parts
 from jcr.errors import InputError, RejectedError, count_of, first_few
 from jcr.estimation.observability import observability
 from jcr.estimation.pose_misfit import (
@@ -28,7 +31,7 @@ from jcr.estimation.pose_misfit import (
     pair_angles,
     pose_misfit,
 )
-from jcr.geometry import Poses, rotation_angle
+from jcr.geometry import Poses, inverse, rotation_angle
 from jcr.number_format import significant
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Reading, Reconstruction
@@ -63,20 +66,20 @@ class _Fit(NamedTuple):
 
 
 def decided_by_images(
-    capture: Capture, seed: int = 0, progress: Progress = silent
+    capture: Capture, board: str | None = None, seed: int = 0, progress: Progress = silent
 ) -> tuple[Capture, Reconstruction | None]:
-    """Return a capture whose reading is decided, and the reconstruction without poses if that decided it.
+    """Return a capture whose reading is decided, and the reconstruction without poses if a run can use it.
 
-    A capture without `candidates` is returned as it is. Raises InputError as `decide`, or if the images cannot be
-    reconstructed; the message then lists the readings.
+    `board` is the value of the option --board. A capture without `candidates` is returned as it is. Raises InputError
+    as `decide`, or if the images cannot be reconstructed; the message then lists the readings.
     """
     if not capture.candidates:
         return capture, None
-    from jcr.sfm.colmap import reconstruct_alone
-
     readings = [reading for reading, _ in capture.candidates]
     try:
-        made = reconstruct_alone(capture, seed, progress)
+        with TemporaryDirectory(prefix="jcr-moving-") as moving:
+            seen = with_moving_parts(capture, Path(moving)) if capture.mount == "base" else capture
+            made = _from_images_alone(seen, board, seed, progress)
     except RejectedError as error:
         if len(capture.candidates[0][1]) != len(capture):
             raise count_differs(capture) from None
@@ -84,7 +87,37 @@ def decided_by_images(
             f"{undecided(str(capture.source), readings)}; the images do not tell: {error.what}"
         ) from None
     decided = decide(capture, made.recon_from_camera, made.image_index)
-    return decided, made if len(decided) == len(capture) else None  # its rows are those of all images
+    # A run tests given intrinsics, and uses a board; its rows are those of all images.
+    is_of_run = board is None and capture.intrinsics is None and len(decided) == len(capture)
+    return decided, made if is_of_run else None
+
+
+def _from_images_alone(capture: Capture, board: str | None, seed: int, progress: Progress) -> Reconstruction:
+    """Return the reconstruction without poses: from the board if it is given and seen, else from features.
+
+    Given intrinsics with which fewer than half of the images register may be wrong, and are then estimated. Raises
+    RejectedError if the images cannot be reconstructed.
+    """
+    from jcr.boards.marker import reconstruct_marker
+    from jcr.sfm.colmap import reconstruct_alone
+
+    if board is not None:
+        with suppress(RejectedError):
+            return reconstruct_marker(capture, board, progress)
+    failure, made = None, list[Reconstruction]()
+    free = replace(capture, intrinsics=None, intrinsics_std=None)
+    for one in (capture, free) if capture.intrinsics is not None else (capture,):
+        try:
+            made.append(reconstruct_alone(one, seed, progress))
+        except RejectedError as error:
+            failure = failure or error
+            continue
+        if 2 * len(made[-1].image_index) >= len(capture):
+            break
+    if not made:
+        assert failure is not None
+        raise failure
+    return max(made, key=lambda one: len(one.image_index))
 
 
 def first_reading(capture: Capture) -> Capture:
@@ -107,6 +140,24 @@ def decide(capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray,
     InputError if rows and images differ in number, if no reading fits, if several do, or if the poses fit in another
     order; the message states what fits, which is never taken.
     """
+    if capture.mount == "base":
+        # Seen from what the gripper carries, a fixed camera moves by the inverse poses.
+        inverted = tuple((reading, inverse(poses)) for reading, poses in capture.candidates)
+        capture = replace(capture, mount="gripper", candidates=inverted)
+        decided = _fitting(capture, recon_from_camera, image_index)
+        return replace(decided, mount="base", base_from_gripper=inverse(decided.base_from_gripper))
+    decided = _fitting(capture, recon_from_camera, image_index)
+    if decided.reading is None or not decided.reading.inverted:
+        return decided
+    note = (
+        "the poses fit as the base in the gripper frame; if the camera is beside the robot and watches the gripper, "
+        "calibrate with --mount base instead"
+    )
+    return replace(decided, notes=(*decided.notes, note))
+
+
+def _fitting(capture: Capture, recon_from_camera: Poses, image_index: Int[ndarray, " m"]) -> Capture:
+    """Return the capture of a camera on the gripper with the reading that fits; raise InputError as `decide`."""
     if len(capture.candidates[0][1]) != len(capture):
         raise _rows_of_images(capture, recon_from_camera, image_index)
     fits = _ranked(capture.candidates, recon_from_camera, image_index)
@@ -128,7 +179,8 @@ def _taken(
         if not best.misfit.is_of_robot:
             raise InputError(
                 f"{where}: the poses fit the images in no reading; the best is {text_of(best.reading)}, which disagrees "
-                f"by {_size(best.misfit)}: check that poses and images are of one capture and in one order"
+                f"by {_size(best.misfit)}: check that poses and images are of one capture and in one order, and that "
+                "--mount base is given if, and only if, the camera is beside the robot"
             )
         rivals = [best, *(fit for fit in others if fit.misfit.mm < BETTER * size)]
         sizes = ", ".join(_size(fit.misfit) for fit in rivals[:6])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from jcr.backends import BackendName
+from jcr.backends import BackendName, ReconstructOptions
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.capture.added_capture import with_added_images
@@ -76,13 +76,15 @@ def run(
         boards(options.reconstruct.board)  # raises InputError if the option does not describe a board
     if not isinstance(capture, Capture | str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
+    if (out / "capture.json").is_file():
+        raise InputError(f"{out}: is a capture, and the results need a folder of their own; name another one")
     if not isinstance(capture, Capture):
         with locked(out):
             capture = read_capture(capture, into=out / CAPTURE)
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
     options, missing = _possible(replace(options, reconstruct=own), capture, out)
     with locked(out):
-        capture, alone = _decided(capture, out, own.seed, progress)
+        capture, alone = _decided(capture, out, own, progress)
         result = begun(out, kept(capture, out / CAPTURE), options)
         if alone is not None and own.backend in ("auto", "colmap") and own.features in ("auto", "sift"):
             keep_reconstruction(result, alone)
@@ -227,7 +229,7 @@ def measure(out: str | Path) -> "Measurement":
 
 
 def _decided(
-    capture: Capture, out: Path, seed: int, report: Progress
+    capture: Capture, out: Path, options: ReconstructOptions, report: Progress
 ) -> tuple[Capture, Reconstruction | None]:
     """Return the capture with a decided reading, and the reconstruction that decided it if it has nearly all images.
 
@@ -237,7 +239,7 @@ def _decided(
         return capture, None
     if (known := _decided_before(capture, out / CAPTURE)) is not None:
         return known, None
-    capture, made = decided_by_images(capture, seed, report)
+    capture, made = decided_by_images(capture, options.board, options.seed, report)
     is_enough = made is not None and len(made.image_index) >= SIFT_SUFFICES * len(capture)
     return capture, made if is_enough else None
 
@@ -248,7 +250,11 @@ def _decided_before(capture: Capture, folder: Path) -> Capture | None:
         before = read_kept(folder)
         rows = [capture.images.index(name) for name in before.images]
         images = ((capture.folder / name, folder / name) for name in before.images)
-        if before.reading is None or not all(a.read_bytes() == b.read_bytes() for a, b in images):
+        if (
+            before.reading is None
+            or before.mount != capture.mount
+            or not all(a.read_bytes() == b.read_bytes() for a, b in images)
+        ):
             return None
         for _, poses in capture.candidates:
             if len(poses) == len(capture) and np.allclose(poses[rows], before.base_from_gripper, atol=1e-9):

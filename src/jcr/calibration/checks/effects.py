@@ -250,6 +250,8 @@ def _best(model: Examined, passed: Collection[FindingKind], of_camera: bool) -> 
     it is more significant in the true order of the images than in nearly all random orders.
     """
     tests = list[Test]()
+    if of_camera and model.solution.is_astray:
+        return None  # each would be adjusted from there, which takes long and leads nowhere
     for one in _promising(model, passed, of_camera):
         with suppress(np.linalg.LinAlgError):
             tests.append(confirm(model, one))
