@@ -38,8 +38,8 @@ class ReadOptions:
     camera_info: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """File with the intrinsics (OpenCV, ROS, Kalibr, RealSense, COLMAP, a 3x3 matrix); by default the capture's."""
     mount: Mount = "gripper"
-    """Body that the camera is mounted on: the gripper, or the base, which is beside the robot with the gripper in view. A
-    capture.json states it itself."""
+    """Body that the camera is mounted on: the gripper, or the base for a camera beside the robot that sees the gripper.
+    A capture.json states it itself."""
     format: FormatName = "auto"
     """Format of the capture, if its files do not show it (jcr docs captures)."""
     frames: Annotated[int, tyro.conf.arg(metavar="COUNT")] = 15
