@@ -3,6 +3,7 @@
 A *body* is a rigid object of known size: a board, or a single tag.
 """
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -64,6 +65,12 @@ class Board:
     """Side of a square or tag, m; 1 if it is unknown."""
     size_std: float | None
     """Relative standard deviation of the size; None: the side is unknown and is the unit of length."""
+
+
+_DETECTED: dict[tuple[str, tuple[int, ...], bytes], list[Sighting]] = {}
+MOST_KEPT = 2000
+"""Detections by board and image (name, size, hash), which several back ends ask for, and the number that is kept. An
+image without the board is searched for a second."""
 
 
 def boards(spec: str) -> list[Board]:
@@ -260,6 +267,16 @@ def _single_tags(side: float, tags: cv2.aruco.Dictionary) -> Detector:
     return detect
 
 
+def _detected(board: Board, grey: UInt8[ndarray, "h w"]) -> list[Sighting]:
+    """Return the detections of a board in a grey image, which later back ends do not search again."""
+    key = board.name, grey.shape, hashlib.sha256(grey.tobytes()).digest()
+    if key not in _DETECTED:
+        if len(_DETECTED) >= MOST_KEPT:
+            _DETECTED.clear()
+        _DETECTED[key] = board.detect(grey)
+    return _DETECTED[key]
+
+
 def most_seen(
     readings: Sequence[Board], images: Sequence[UInt8[ndarray, "h w 3"]]
 ) -> tuple[Board, list[list[Sighting]]]:
@@ -277,7 +294,7 @@ def most_seen(
             prepared = [cv2.inpaint(*of, 3, cv2.INPAINT_TELEA) for of in zip(images, ink, strict=True)]
         grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in prepared]
         for board in readings:
-            found = [board.detect(image) for image in grey]
+            found = [_detected(board, image) for image in grey]
             count = sum(len(sighting.index) for sightings in found for sighting in sightings)
             if count > points:
                 best, seen, points = board, found, count
