@@ -193,7 +193,13 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
     true = json.loads((tabletop / "truth" / "scene.json").read_text())["objects"]
     places = np.array([thing["base_from_box"] for thing in true])[:, :2, 3]
     near = [np.linalg.norm(places - np.array(size["base_from_box"])[:2, 3], axis=1) for size in found]
-    heights = {int(d.argmin()): size["height"] for d, size in zip(near, found, strict=True) if d.min() < 0.02}
+    at = {int(d.argmin()): size for d, size in zip(near, found, strict=True) if d.min() < 0.02}
+    heights = {k: size["height"] for k, size in at.items()}
+    beyond = {
+        true[k]["name"]: (size["height"] - true[k]["height"]) / size["height_std"] for k, size in at.items()
+    }
+    # The recessed lid of the can and the rim of the mug were 11 and 12 of their own σ off.
+    assert all(abs(sigmas) < 3 for name, sigmas in beyond.items() if name != "apple"), beyond
     assert len(heights) >= 5
     # The stalk of the apple, 3 mm thick, is beyond what depth resolves.
     off = {true[k]["name"]: height / true[k]["height"] - 1 for k, height in heights.items()}
