@@ -197,3 +197,11 @@ def test_a_file_that_is_not_written_whole_leaves_the_old_one_and_nothing_beside_
         temporary.write_text("new")
         raise KeyboardInterrupt
     assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("map.bin", "old")]
+
+
+def test_the_run_of_another_capture_is_not_overwritten(sound: Path, small_capture: Path):
+    """The map and the accepted calibration of another capture were deleted without a word."""
+    before = (sound / "calibration.json").read_bytes()
+    with refused("holds the run of .*; name another folder, or delete it"):
+        calibrate(small_capture, sound)
+    assert (sound / "calibration.json").read_bytes() == before

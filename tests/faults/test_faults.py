@@ -163,6 +163,10 @@ def test_a_damaged_reconstruction_is_named_others_stay(tmp_path: Path, small_don
 def test_a_failed_run_leaves_no_map_of_an_earlier_one(tmp_path: Path, sound: Path, small_done: Path, capsys):
     out = tmp_path / "out"
     shutil.copytree(small_done, out)
+    state = json.loads((out / "run.json").read_text()) | {
+        "capture": str(sound.resolve())
+    }  # now with other images
+    (out / "run.json").write_text(json.dumps(state))
     assert dispatch(["calibrate", str(sound), str(out), "--backend", "colmap", "--quiet"]) == 3
     assert read_calibration(out).parent_from_camera is None
     kept = {path.name for path in out.iterdir()}

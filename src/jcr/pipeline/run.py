@@ -83,6 +83,7 @@ def run(
             capture = read_capture(capture, into=out / CAPTURE)
     own = options.reconstruct if backend is None else replace(options.reconstruct, backend=backend)
     options, missing = _possible(replace(options, reconstruct=own), capture, out)
+    _require_own_run(capture, out)
     with locked(out):
         capture, alone = _decided(capture, out, own, progress)
         result = begun(out, kept(capture, out / CAPTURE), options)
@@ -226,6 +227,15 @@ def measure(out: str | Path) -> "Measurement":
     from jcr.segments.measure import measure_objects
 
     return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)
+
+
+def _require_own_run(capture: Capture, out: Path) -> None:
+    """Raise InputError if the folder `out` holds the run of another capture, whose results would be lost."""
+    other = None
+    with suppress(InputError):  # there is no run
+        other = Path(RunResult(out).state.capture)
+    if other is not None and capture.source is None and other.is_dir() and other != capture.folder.resolve():
+        raise InputError(f"{out}: holds the run of {other}; name another folder, or delete it")
 
 
 def _decided(
