@@ -183,4 +183,4 @@ def test_images_that_are_left_out_lead_the_warnings_where_they_are_most():
     case = fitted_case(capture, made, CalibrateOptions(), errors_of(problem.base_from_gripper[:5]))
     first = check_remarks(case).calibration.findings[0]
     assert first.kind is FindingKind.HALF_UNUSED and first.severity == "warns"
-    assert "only 5 of 12 images are used: 7 were not registered, 0 contradict the others" in first.text
+    assert "only 5 of 12 images are used: 7 not registered, 0 in contradiction to the others" in first.text

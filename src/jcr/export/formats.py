@@ -119,7 +119,9 @@ def write_run(
         raise InputError(f"--to-root: is for files of frames; {format} has the camera itself, leave it out")
     if options.into is not None and format != "urdf":
         raise InputError(f"--into {options.into}: is for the format urdf")
-    path = path or out / "export" / (row.file if options.into is None else options.into.name)
+    # Files of several cameras stand side by side.
+    own_name = row.file if options.camera is None else f"{options.camera}_{row.file}"
+    path = path or out / "export" / (own_name if options.into is None else options.into.name)
     runs = [out]
     if format == "lerobot" and out.is_dir() and not (out / CALIBRATION).is_file():  # the folder of a batch
         runs = sorted(file.parent for file in out.glob(f"*/{CALIBRATION}")) or runs
@@ -280,7 +282,8 @@ class ExportedRun:
         if camera is None:
             return None
         words, given = f"belongs to {intrinsics_in_words(camera)}", found.with_given_intrinsics
-        command = "" if contents == "camera_frame" else f"jcr export {self.run.out} camera_info"
+        of_camera = f" --camera {self.options.camera}" if self.options.camera is not None else ""
+        command = "" if contents == "camera_frame" else f"jcr export {self.run.out} camera_info{of_camera}"
         if self.camera is not None or given is None:
             return f"{words}; {command} writes them" if command else words
         if self.options.intrinsics == "given":

@@ -335,8 +335,8 @@ class FindingKind(StrEnum):
         "put different, textured objects on the table", explains=UNMATCHED,
         means="regular tiles or patterns; rejects where the calibration is rejected")
     HALF_UNUSED = "most images left out", KindRow("images",
-        "only {value:.0f} of {of:.0f} images are used: {lost:.0f} were not registered, {wrong:.0f} contradict the "
-        "others",
+        "only {value:.0f} of {of:.0f} images are used: {lost:.0f} not registered, {wrong:.0f} in contradiction to "
+        "the others",
         "check the unused images and their poses; take more images that overlap"),
     FEW_USED = "few images used", KindRow("reconstruction",
         "only {value:.0f} of {of:.0f} images are used, whose motions alone are degenerate; those of "

@@ -226,7 +226,9 @@ def measure(out: str | Path) -> "Measurement":
     """Measure support plane and objects of the run folder `out`; raise InputError without a map or support plane."""
     from jcr.segments.measure import measure_objects
 
-    return measure_objects(read_cloud(Path(out) / CLOUD), RunResult(out).scale_std)
+    run = RunResult(Path(out))
+    std = run.scale_std  # raises InputError if there is no run
+    return measure_objects(read_cloud(run.out / CLOUD), std)
 
 
 def _require_own_run(capture: Capture, out: Path) -> None:

@@ -4,6 +4,7 @@ Parts that are only shown or hidden need no control here, because viser lists al
 """
 
 import io
+import logging
 import threading
 from contextlib import redirect_stdout
 from functools import partial
@@ -86,6 +87,8 @@ def open_server(port: int, title: str) -> LocalServer:
     """
     if not 0 <= port <= 65535:
         raise InputError(f"--port {port}: no such port; take one from 1024 to 65535, or 0 for any free one")
+    # A browser that closes its connection early is no error of the viewer.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     with redirect_stdout(io.StringIO()):
         server = LocalServer(host=HOST, port=port, label=title, verbose=False)
     if port not in (0, server.get_port()):  # viser uses the next free port without an error
