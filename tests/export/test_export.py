@@ -25,15 +25,17 @@ from scipy.spatial.transform import Rotation
 
 import analytic_scene
 import jcr
+from in_process import run_jcr
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
+from jcr.cell.placement import CameraPlacement, CamerasFile, TransformUncertainty, write_cameras
 from jcr.cli import dispatch
 from jcr.errors import RejectedError
 from jcr.export import ros, simulators
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.options import ExportOptions, provenance
 from jcr.geometry import ROOT_FROM_OPTICAL, Similarity, apply, inverse, rotation_exp, transform
-from jcr.records import Intrinsics, Tracks
+from jcr.records import CellCamera, Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
 from places import ROOT
 from refusal import refused
@@ -163,6 +165,31 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
     with refused("--intrinsics given"):
         export_run(done, "camera_info", tmp_path / "none.yaml", {"intrinsics": "given"})
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": kept}))
+
+
+def test_files_of_several_cameras_stand_side_by_side_and_the_hint_names_the_camera(tmp_path: Path):
+    """The file of a second camera was refused, or took the place of the first; the hint wrote the first's intrinsics."""
+    out = shutil.copytree(ROOT / "tests" / "calibrations", tmp_path / "out")
+    (out / "accepted.json").rename(out / "calibration.json")
+    camera = CellCamera(name="fixed0", mount="base", images=("0.png",), image_size=(640, 480))
+    spread = TransformUncertainty.of(1e-6 * np.eye(6))
+    place = CameraPlacement.of(
+        camera, (), base_from_camera=PARENT_FROM_CHILD, uncertainty=spread, intrinsics=CAMERA.with_std(None)
+    )
+    write_cameras(out, CamerasFile(cameras=[place], arms=[], version=jcr.__version__))
+    for format in ("camera_info", "urdf"):
+        own = run_jcr("export", out, format, "--parent-frame", "tool0")
+        other = run_jcr("export", out, format, "--camera", "fixed0")
+        assert own.returncode == other.returncode == 0, (own.stderr, other.stderr)
+    assert f"jcr export {out} camera_info --camera fixed0 writes them" in other.stdout + other.stderr
+    exported = {file.name for file in (out / "export").iterdir()}
+    assert exported == {
+        "camera_info.yaml",
+        "hand_eye.urdf",
+        "fixed0_camera_info.yaml",
+        "fixed0_hand_eye.urdf",
+    }
+    assert "610" in (out / "export" / "fixed0_camera_info.yaml").read_text()
 
 
 def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path):
