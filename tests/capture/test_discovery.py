@@ -314,6 +314,10 @@ def test_the_images_decide_once_and_the_run_keeps_the_reading(half_capture: Path
     done = run_jcr("calibrate", tmp_path / "a", tmp_path / "out")
     assert done.returncode == 0 and "angles ZYZ in degrees" in done.stdout, done.stdout + done.stderr
     assert "decided by the images" in done.stdout
+    seconds = json.loads((tmp_path / "out" / "calibration.json").read_text())["timings_s"]
+    assert seconds["decide"] > seconds["reconstruct"], (
+        "what decided is the reconstruction, and its time was not stated"
+    )
     kept = jcr.read_capture(tmp_path / "out/capture")
     assert kept.reading is not None and kept.reading.decided_by == "images" and len(kept) == 7
     np.testing.assert_allclose(kept.base_from_gripper, poses, atol=1e-8)

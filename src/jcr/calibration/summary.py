@@ -102,7 +102,7 @@ def summary(content: AnyCalibration, most: int = MOST_LINES) -> str:
     backend = BACKEND_NAMES.get(content.backend, content.backend)
     used = f"{content.images_used} of {count_of(len(content.images), 'image')}"
     # The times of depth and map follow in log.txt; the first line is the same before and after these stages.
-    seconds = sum(content.timings_s.get(stage, 0.0) for stage in ("reconstruct", "calibrate"))
+    seconds = sum(content.timings_s.get(stage, 0.0) for stage in ("decide", "reconstruct", "calibrate"))
     lines = [f"{verdict_in_words(content.findings)}{limit}. {used}, {backend}, {seconds:.0f} s"]
     if isinstance(content, Calibration) and content.converged:
         lines += _result(content)

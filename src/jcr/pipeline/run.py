@@ -85,7 +85,9 @@ def run(
     options, missing = _possible(replace(options, reconstruct=own), capture, out)
     _require_own_run(capture, out)
     with locked(out):
+        start, is_open = time.perf_counter(), bool(capture.candidates)
         capture, alone = _decided(capture, out, own, progress)
+        decision_s = {"decide": round(time.perf_counter() - start, 3)} if is_open else {}
         result = begun(out, kept(capture, out / CAPTURE), options)
         if alone is not None and own.backend in ("auto", "colmap") and own.features in ("auto", "sift"):
             keep_reconstruction(result, alone)
@@ -100,7 +102,8 @@ def run(
         else:
             result = result.with_parts(cloud=None, scene=None, measured=None)
         result = make(result, FIRST, progress)
-        result = result.with_parts(calibration=result.calibration.with_notes(*missing))
+        content = result.calibration.with_notes(*missing)
+        result = result.with_parts(calibration=replace(content, timings_s=decision_s | content.timings_s))
         if calibrated is not None:
             calibrated(result)
         return finished(result, REST, progress)
