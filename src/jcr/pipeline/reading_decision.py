@@ -99,7 +99,7 @@ def _from_images_alone(capture: Capture, board: str | None, seed: int, progress:
     RejectedError if the images cannot be reconstructed.
     """
     from jcr.boards.marker import reconstruct_marker
-    from jcr.sfm.colmap import reconstruct_alone
+    from jcr.sfm.colmap import MOST_ALONE, reconstruct_alone
 
     if board is not None:
         with suppress(RejectedError):
@@ -112,7 +112,7 @@ def _from_images_alone(capture: Capture, board: str | None, seed: int, progress:
         except RejectedError as error:
             failure = failure or error
             continue
-        if 2 * len(made[-1].image_index) >= len(capture):
+        if 2 * len(made[-1].image_index) >= min(len(capture), MOST_ALONE):
             break
     if not made:
         assert failure is not None
