@@ -215,6 +215,7 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
     (["export", "a", "octomapp"], "did you mean octomap?"),
     (["run", "a", "b", "--require", "2"], "--require takes MM DEG|none, not '2' (jcr run --help)"),
     (["run", "a", "-o", "b"], "jcr run has no option -o"),
+    (["run", ROOT / "examples/tabletop", "b", "--workspace", "1", "1", "1", "0", "0", "0"], "minima below maxima"),
     (["verify", "a", "--board", "b"], "it is an option of jcr run, jcr calibrate, jcr batch and jcr check (jcr verify"),
     (["run", "a", "--out", "b"], "give it by its place: jcr run CAPTURE OUT (jcr run --help)"),
     (["run", "a", "b", "--frobnicate"], "jcr run has no option --frobnicate (jcr run --help)"),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from jcr.backends import BackendName, ReconstructOptions
+from jcr.backends import BackendName, ReconstructOptions, device_of
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.capture.added_capture import with_added_images
@@ -44,7 +44,7 @@ from jcr.records import Capture, PosePairs, Reconstruction
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import MAP_PACKAGES, require_packages
-from jcr.scene.options import CloudOptions, MapOptions
+from jcr.scene.options import CloudOptions, MapOptions, check_workspace
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
@@ -69,11 +69,7 @@ def run(
     """
     out = Path(out)
     options = checked_options(options, RunOptions)
-    check_options(options.calibrate)
-    if options.reconstruct.board is not None:
-        from jcr.boards.detection import boards
-
-        boards(options.reconstruct.board)  # raises InputError if the option does not describe a board
+    _require_valid(options)
     if not isinstance(capture, Capture | str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
     if (out / "capture.json").is_file():
@@ -232,6 +228,19 @@ def measure(out: str | Path) -> "Measurement":
     run = RunResult(Path(out))
     std = run.scale_std  # raises InputError if there is no run
     return measure_objects(read_cloud(run.out / CLOUD), std)
+
+
+def _require_valid(options: RunOptions) -> None:
+    """Raise InputError for options that a late stage would refuse, before time is spent on the images."""
+    check_options(options.calibrate)
+    if options.reconstruct.board is not None:
+        from jcr.boards.detection import boards
+
+        boards(options.reconstruct.board)  # raises InputError if the option does not describe a board
+    if options.map is not None:
+        check_workspace(options.map.workspace)
+    if options.reconstruct.device == "cuda":
+        device_of(options.reconstruct)
 
 
 def _require_own_run(capture: Capture, out: Path) -> None:

@@ -1,9 +1,13 @@
 """Options of cloud and map, separate from the code that imports torch so that the command-line help loads fast."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 from typing import Annotated, Literal
 
 import tyro
+
+from jcr.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -40,3 +44,14 @@ class MapOptions:
     """Longest time (s) of the training; it stops earlier on a plateau."""
     map_seed: int = 0
     """Seed of the samples and of the initial weights."""
+
+
+def check_workspace(workspace: Sequence[float] | None) -> None:
+    """Raise InputError unless `workspace` is None, or three finite minima (m) below three finite maxima."""
+    if workspace is None:
+        return
+    pairs = zip(workspace[:3], workspace[3:], strict=True)
+    if not all(isfinite(low) and isfinite(high) and low < high for low, high in pairs):
+        raise InputError(
+            f"workspace {tuple(workspace)}: give xmin ymin zmin xmax ymax zmax (m), minima below maxima"
+        )

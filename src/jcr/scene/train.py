@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from jcr.errors import InputError
 from jcr.records import PointCloud
 from jcr.scene.fields import Field
+from jcr.scene.options import check_workspace
 from jcr.scene.seen_space import CROSSED, HIT, SeenGrid
 
 CLEARANCE = 0.1
@@ -65,12 +66,8 @@ def workspace_box(
     1.5 times the median distance. Raises InputError for an invalid `workspace` or an empty cloud.
     """
     if workspace is not None:
-        box = np.array(workspace, dtype=np.float64).reshape(2, 3)
-        if not np.isfinite(box).all() or (box[0] >= box[1]).any():
-            raise InputError(
-                f"workspace {workspace}: give xmin ymin zmin xmax ymax zmax (m), minima below maxima"
-            )
-        return box
+        check_workspace(workspace)
+        return np.array(workspace, dtype=np.float64).reshape(2, 3)
     if len(cloud.points_in_base) == 0:
         raise InputError("the cloud holds no points; a map needs at least some hundreds")
     # The background behind the scene, and a few outliers, must not enlarge the workspace.
