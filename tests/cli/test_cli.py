@@ -1,5 +1,6 @@
 """The command line on the bundled capture and on faults: results, exit statuses, printed words."""
 
+import io
 import json
 import shutil
 import subprocess
@@ -21,9 +22,11 @@ from jcr.cli import dispatch
 from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.cli.check_verify_compare import CheckCommand, _command_of_remedy
 from jcr.cli.map_query_export_view import PRINTED_POINTS, read_points
+from jcr.cli.output import write_lines
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import scale_translation, transform
 from jcr.live.session import SessionOptions
+from jcr.number_format import INDENT, labelled
 from jcr.pipeline import run
 from jcr.records import Reading, Requirement
 from jcr.scene.cloud import read_cloud
@@ -32,6 +35,8 @@ from places import ROOT
 from refusal import refused
 from scenes import capture_of
 from simulation.problems import hand_eye_problem
+
+CALIBRATIONS = ROOT / "tests" / "calibrations"
 
 
 @pytest.fixture(scope="module")
@@ -266,6 +271,27 @@ def test_compared_calibrations_agree_or_differ(tmp_path: Path):
     assert close.returncode == 0 and close.stdout.startswith("AGREE: 0.300 mm")
     assert far.returncode == 3 and far.stdout.startswith("DIFFER: 170.000 mm")
     assert "of the same camera and gripper frame" in far.stdout
+
+
+def test_a_comparison_with_a_rejected_calibration_decides_nothing_and_names_no_cause():
+    found = run_jcr("compare", CALIBRATIONS / "accepted.json", CALIBRATIONS / "rejected.json")
+    assert found.returncode == 3 and found.stdout.startswith("NOT DECIDED: ")
+    assert "rejected.json is rejected" in found.stdout.splitlines()[0]
+    assert "remove the cause of the rejection" in found.stdout and "the camera moved" not in found.stdout
+
+
+def test_long_lines_are_wrapped_below_their_label_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch):
+    lines = [*labelled("WARNING", " ".join(["word"] * 30)), *labelled("Next", "jcr run " + "a " * 60)]
+    for is_terminal in (False, True):
+        output = io.StringIO()
+        monkeypatch.setattr(output, "isatty", lambda is_terminal=is_terminal: is_terminal, raising=False)
+        monkeypatch.setattr(sys, "stdout", output)
+        monkeypatch.setenv("COLUMNS", "80")
+        write_lines(lines)
+        *wrapped, following = output.getvalue().splitlines()
+        assert following == lines[-1], "a command to copy stays on one line"
+        assert wrapped == lines[:-1] if not is_terminal else max(map(len, wrapped)) <= 80
+    assert wrapped[1].startswith(" " * INDENT + "word") and len(wrapped) > 1
 
 
 def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):

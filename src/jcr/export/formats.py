@@ -204,10 +204,8 @@ class ExportedRun:
         Raises InputError also if the name of the gripper frame is needed and unknown.
         """
         mount = self.camera_frame
-        if not mount.is_fixed and self.gripper_frame in (
-            None,
-            "FRAME",
-        ):  # FRAME stands for a name, as in messages
+        # FRAME stands for a name in messages, and is none.
+        if not mount.is_fixed and self.gripper_frame in (None, "FRAME"):
             raise InputError(
                 f"{self.run.out}: the capture does not name the gripper frame of its poses, the parent of the camera; "
                 "add --parent-frame FRAME (the frame that the robot reports: tool0, flange, panda_hand, a TCP, …)"

@@ -22,7 +22,7 @@ other images, other intrinsics, corrected gripper poses, a firm mount, the arm's
 Verdict = Literal["accepted", "accepted, but not as exact as needed", "not checked", "rejected"]
 """Verdicts from best to worst: nothing contradicts the calibration and the required accuracy is reached, or none is
 required; nothing contradicts it and the accuracy is missed; no check was made; a check contradicts it."""
-MORE_IMAGES = ("UNCERTAIN", "LEAVE_ONE_OUT")
+MORE_IMAGES = {FindingKind.UNCERTAIN, FindingKind.LEAVE_ONE_OUT}
 """Kinds with the remedy "more images", which does not help where a finding of another kind rejects the calibration."""
 RANK: dict[Severity, int] = {"rejects": 0, "warns": 1, "informs": 2}
 
@@ -274,15 +274,15 @@ def is_explained(findings: Sequence[Finding]) -> bool:
 def without_consequences(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Return sorted findings; if the first one rejects, what follows from it is left out.
 
-    That are the kinds that it explains, and the advice of more images, unless it is such advice itself.
+    Left out are the kinds that it explains and, unless it is of such a kind itself, the kinds MORE_IMAGES.
     """
     if not findings or findings[0].severity != "rejects":
         return tuple(findings)
     first, *others = findings
     if is_explained(findings):
         others = [one for one in others if one.kind not in first.kind.row.explains]
-    is_advice = first.kind.name in MORE_IMAGES
-    return (first, *(one for one in others if is_advice or one.kind.name not in MORE_IMAGES))
+    is_advice = first.kind in MORE_IMAGES
+    return (first, *(one for one in others if is_advice or one.kind not in MORE_IMAGES))
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:

@@ -165,11 +165,11 @@ class FindingKind(StrEnum):
         means="the calibration is that of `--method paper`")
     NOT_EXACT_ENOUGH = "requirement not met", KindRow("motion", REACHED,
         f"{{concerns:images=add {{more_images:.0f}} more, {ROTATED}|robot=most of the error is systematic robot "
-        "error: name the arm (--robot), or give joint angles and the arm's URDF (--urdf)|intrinsics=most of the error "
-        "is due to intrinsics: give calibrated ones (--camera-info), or add images at other distances, rolled about the "
-        "optical axis|mount=part of the error is a change that a warning states: remove its cause and take the images "
-        "again|none=more than 12 further images would be needed: move closer to the scene, or use a more accurate "
-        "camera or robot}",
+        "error: name the arm (--robot), or add joint angles and a URDF (jcr docs captures)|intrinsics=most of the error "
+        "is due to intrinsics: give calibrated ones (--camera-info or capture.json), or add images at other distances, "
+        "rolled about the optical axis|mount=part of the error is a change that a warning states: remove its cause and "
+        "take the images again|none=more than 12 further images would be needed: move closer to the scene, or use a "
+        "more accurate camera or robot}",
         means="the calibration is sound, and not as exact as `--require` states; the default is 5 mm and 1°",
         help="more images; or the arm's name")
     FOCUS_BY_DISTANCE = "focal length changes with distance", KindRow("camera",

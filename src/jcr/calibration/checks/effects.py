@@ -247,11 +247,12 @@ def _best(model: Examined, passed: Collection[FindingKind], of_camera: bool) -> 
     `of_camera` True tests effects on the camera, False effects on the reported poses. Kinds in `passed` are not tested.
     There is no effect if the best estimate is implausibly large (`Policy.largest`). There is none either if poses and
     images contradict each other even with the effect estimated: they then have another fault. A motion counts only if
-    it is more significant in the true order of the images than in nearly all random orders.
+    it is more significant in the true order of the images than in nearly all random orders. An effect on the camera
+    needs an adjustment that starts from a solution, and there is none where the solution is astray.
     """
     tests = list[Test]()
     if of_camera and model.solution.is_astray:
-        return None  # each would be adjusted from there, which takes long and leads nowhere
+        return None
     for one in _promising(model, passed, of_camera):
         with suppress(np.linalg.LinAlgError):
             tests.append(confirm(model, one))
