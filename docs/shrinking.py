@@ -55,7 +55,9 @@ def shown_during(first: int, last: int, count: int) -> str:
         times, values = times[1:], values[1:]
     stops = ";".join(f"{time:.4f}" for time in times)
     return (
-        f'<animate attributeName="opacity" calcMode="discrete" dur="{whole:.1f}s" repeatCount="indefinite" '
+        # It begins with the last state, so that a reader first sees the result.
+        f'<animate attributeName="opacity" calcMode="discrete" dur="{whole:.1f}s" begin="{STAY_S - whole:.1f}s" '
+        f'repeatCount="indefinite" '
         f'values="{";".join(values)}" keyTimes="{stops}"/>'
     )
 

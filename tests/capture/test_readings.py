@@ -18,7 +18,7 @@ from jcr.capture.notations import (
 )
 from jcr.capture.options import ReadOptions
 from jcr.capture.readings import Candidate, pose_columns, readings_of, text_of
-from jcr.geometry import inverse
+from jcr.geometry import inverse, transform
 from refusal import refused
 from simulation.problems import hand_eye_problem
 
@@ -184,6 +184,9 @@ NAMED = {
     "tvec rvec": (VECTOR, "tvec.0 tvec.1 tvec.2 rvec.0 rvec.1 rvec.2", "rotvec"),
     "R and t": (np.hstack([POSITION, ROTATION.reshape(-1, 9)]),
                 "t.0 t.1 t.2 " + " ".join(f"R.{i}.{j}" for i in range(3) for j in range(3)), None),
+    "t_vec and a whole transform without translation": (
+        np.hstack([POSITION, transform(ROTATION, np.zeros(3)).reshape(-1, 16)]),
+        "t_vec.0 t_vec.1 t_vec.2 " + " ".join(f"r_mtx.{i}.{j}" for i in range(4) for j in range(4)), None),
 }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,8 @@ import jcr
 from capture_writers import write_easy_handeye2
 from in_process import run_jcr
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.cli import dispatch
+from jcr.cli import COMMANDS, command, dispatch
+from jcr.cli.arguments import _flags
 from jcr.cli.capture import CaptureCommand, _conclude
 from jcr.cli.check_verify_compare import CheckCommand, _command_of_remedy
 from jcr.cli.map_query_export_view import PRINTED_POINTS, read_points
@@ -249,6 +251,19 @@ def test_the_help_breaks_no_line_within_a_sentence(columns: int, monkeypatch: py
         assert len(f"{line.rstrip()} {following.split()[0]}") > columns, line
 
 
+def test_each_option_is_listed_by_the_help_of_its_command_or_by_one_that_this_help_names():
+    def listed(name: str) -> set[str]:
+        return {*re.findall(r"^. (--[a-z-]+)", run_jcr(name, "--help").stdout, re.MULTILINE)}
+
+    for name in COMMANDS:
+        text = run_jcr(name, "--help").stdout
+        named = re.findall(r"^  jcr ([a-z-]+) --help  ", text, re.MULTILINE)
+        found = set().union(listed(name), *map(listed, named))
+        missing = {*_flags(command(name))} - found
+        assert not missing, (name, missing)
+        assert len(text.splitlines()) < 125, name
+
+
 def test_a_rejected_check_prints_the_command_with_the_option_that_reads_the_poses():
     details = {"reading": "angles", "remedy": "give it", "fits": "1 mm", "given": "9 mm"}
     read = {"pose_convention": "euler:xyz", "pose_inverted": 1.0}
@@ -287,8 +302,11 @@ def test_long_lines_are_wrapped_below_their_label_on_a_terminal_alone(monkeypatc
         monkeypatch.setattr(output, "isatty", lambda is_terminal=is_terminal: is_terminal, raising=False)
         monkeypatch.setattr(sys, "stdout", output)
         monkeypatch.setenv("COLUMNS", "80")
+        monkeypatch.delenv("NO_COLOR", raising=False)
         write_lines(lines)
-        *wrapped, following = output.getvalue().splitlines()
+        coloured = output.getvalue()
+        assert coloured.startswith("\033[1;33mWARNING\033[0m ") == is_terminal
+        *wrapped, following = re.sub(r"\033\[[0-9;]*m", "", coloured).splitlines()
         assert following == lines[-1], "a command to copy stays on one line"
         assert wrapped == lines[:-1] if not is_terminal else max(map(len, wrapped)) <= 80
     assert wrapped[1].startswith(" " * INDENT + "word") and len(wrapped) > 1
@@ -301,8 +319,11 @@ def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path
     wrong = run_jcr("capture", tmp_path / "file" / "out", "--camera", 77)
     assert wrong.stderr == f"error: {tmp_path / 'file'}: is a file; name a folder for the results\n"
     (tmp_path / "points.csv").write_text("x,y,z\n0,0,0\n0,nan,0\n")
-    with refused(r"points\.csv: point 2 is not finite"):
+    with refused(r"points\.csv: point 2 is not three finite numbers"):
         read_points(tmp_path / "points.csv")
+    (tmp_path / "0.jpg").touch()
+    wrong = run_jcr("check", tmp_path / "0.jpg")
+    assert wrong.returncode == 2 and "0.jpg: is one image; name the folder" in wrong.stderr
     assert [file.name for file in tmp_path.iterdir()].count("out") == 0
 
 

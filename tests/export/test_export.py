@@ -190,6 +190,8 @@ def test_files_of_several_cameras_stand_side_by_side_and_the_hint_names_the_came
         "fixed0_hand_eye.urdf",
     }
     assert "610" in (out / "export" / "fixed0_camera_info.yaml").read_text()
+    unnamed = run_jcr("export", out, "easy_handeye2", "--camera", "fixed0")  # states the gripper frame, too
+    assert unnamed.returncode == 2 and "add --parent-frame FRAME" in unnamed.stderr
 
 
 def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path):
@@ -660,8 +662,10 @@ def test_a_rejected_calibration_is_exported_by_force_with_its_reason_in_every_fi
     (["urdf", "--child-frame", "tool0"], "different"),
     (["urdf", "--root-from-optical", *"0000001"], "--to-root"),
     (["urdf", "--to-root", "a", "--root-from-optical", *"0000000"], "quaternion"),
-    (["mjcf", "--to-root", "a"], "camera itself"),
-    (["mjcf", "--into", "a.urdf"], "is for the format urdf"),
+    (["mjcf", "--to-root", "a"], "only ros2, moveit, urdf and easy_handeye2"),
+    (["mjcf", "--into", "a.urdf"], "--into: the format mjcf does not use it, only urdf"),
+    (["urdf", "--voxel-size", "0.01"], "--voxel-size: the format urdf does not use it, only octomap and esdf"),
+    (["octomap", "--parent-frame", "tool0"], "--parent-frame: the format octomap does not use it"),
     (["lerobot"], "no run of an episode"),
 ])  # fmt: skip
 def test_what_cannot_be_exported_is_one_line(done: Path, tmp_path, capsys, arguments: list[str], words: str):

@@ -75,6 +75,8 @@ def read_source(
             f"{path}: no such capture; name a folder with a capture.json, or a file or folder of another format "
             "(jcr docs captures)"
         )
+    if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+        raise InputError(f"{path}: is one image; name the folder that holds all images and the gripper poses")
     if options.frames < MIN_FRAMES:
         raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed; take 5 to 15")
     if options.pose_convention != "auto":

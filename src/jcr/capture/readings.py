@@ -37,12 +37,14 @@ UNITS = {
     "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg", "rad": "rad", "radian": "rad", "radians": "rad",
 }  # fmt: skip
 """Units by the words for them in column names."""
-POSITION = {"position", "pos", "translation", "trans", "t", "p", "xyz", "tvec", "location", "point"}
+POSITION = {"position", "pos", "translation", "trans", "t", "p", "xyz", "tvec", "location", "point", "vec"}
 ROTATION = {
     "orientation", "rotation", "rot", "quaternion", "quat", "q", "rpy", "euler", "angle", "angles", "rvec", "rotvec",
-    "vector", "axis", "aa", "r", "xyzw", "wxyz", "matrix",
+    "vector", "axis", "aa", "r", "xyzw", "wxyz", "matrix", "mat", "mtx",
 }  # fmt: skip
 """Words of column names that stand for one half of a pose; the rest of the name is that of the whole pose."""
+ROTATION_OF_12 = (0, 1, 2, 4, 5, 6, 8, 9, 10)
+"""Places of the rotation, row by row, among the numbers of a transform's rows."""
 MOST_UNNAMED = 100
 """Largest number of columns without names in which a pose is looked for; poses and joints of two arms have 30."""
 VECTOR = {"rvec", "rotvec", "vector", "aa"}
@@ -161,7 +163,7 @@ def pose_columns(table: Table, skipped: frozenset[int] = frozenset()) -> list[Po
 def _half(stem: Sequence[str], last: str) -> str:
     """Return the half of a pose that a column belongs to by its name: "position", "rotation", or "" for a whole pose."""
     if last in ("x", "y", "z") or last[:1].isdecimal():
-        if set(stem) & ROTATION and not set(stem) & POSITION - {"t", "p"}:
+        if set(stem) & ROTATION and not set(stem) & POSITION - {"t", "p", "vec"}:
             return "rotation"
         return "" if last[:1].isdecimal() and not set(stem) & POSITION else "position"
     return "rotation"
@@ -177,13 +179,17 @@ def _of_groups(
     positions = dict[str, tuple[int, ...]]()
     rotations = dict[str, list[tuple[tuple[int, ...], tuple[str, ...]]]]()
     for (pose, half), (cells, words) in groups.items():
+        ordered = _numbered(cells) or []
         if half == "position" and {"x", "y", "z"} <= cells.keys():
             positions[pose] = tuple(cells[axis] for axis in "xyz")
-        elif half == "position" and (ordered := _numbered(cells)) and len(ordered) == 3:
+        elif half == "position" and len(ordered) == 3:
             positions[pose] = tuple(ordered)
-        elif half == "rotation" and len(_numbered(cells) or ()) not in (12, 16):
+        elif half == "rotation" and len(ordered) not in (12, 16):
             rotations.setdefault(pose, []).extend(_rotations(cells, words))
-        elif ordered := _numbered(cells):
+        elif half == "rotation" and not numbers[:, ordered[3:12:4]].any():
+            # A rotation that is stored as a whole transform without translation.
+            rotations.setdefault(pose, []).append((tuple(ordered[k] for k in ROTATION_OF_12), ("matrix",)))
+        elif ordered:
             yield from (
                 replace(one, is_named=False, name=pose) for one in _unnamed_poses(ordered, numbers, pose)
             )
@@ -271,7 +277,7 @@ _Layout = tuple[Sequence[int], Sequence[int], tuple[str, ...], Sequence[int]]
 
 def _layouts(n: int) -> Iterator[Sequence[_Layout]]:
     """Yield groups of the layouts that n numbers of a pose may have; a group counts if none before it fits."""
-    by_rows, by_columns = (0, 1, 2, 4, 5, 6, 8, 9, 10), (0, 4, 8, 1, 5, 9, 2, 6, 10)
+    by_rows, by_columns = ROTATION_OF_12, (0, 4, 8, 1, 5, 9, 2, 6, 10)
     if n == 16:
         yield [
             ((3, 7, 11), by_rows, ("matrix",), (12, 13, 14)),

@@ -3,13 +3,15 @@
 The hooks of tyro are in its modules `_errors` and `_fields`; pyproject.toml bounds its minor version.
 """
 
+import dataclasses
+import inspect
 import io
 import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import takewhile
 from typing import Any, get_type_hints
 
@@ -29,6 +31,13 @@ CONFIGURATION = (
 """Settings of tyro for the conversion of a command's fields to options."""
 HELP_WIDTH = 120
 """Largest width of the help's paragraphs in columns, also on a wider terminal."""
+LISTED_BY = {
+    "run": ("reconstruction and calibration", ("calibrate", "reconstruct"), ("calibrate",)),
+    "check": ("reading images and poses that have no capture.json", ("read",), ()),
+    "map": ("points, map and objects", ("cloud", "map", "segment"), ()),
+}
+"""Commands whose help lists the options of a subject for all commands that have them: the subject, the fields of these
+options, and other commands that list them, too."""
 
 
 def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
@@ -45,7 +54,7 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
             case _ if unknown := next((word for word in options if word not in known), None):
                 owners = [f"jcr {name}" for name in COMMANDS if unknown in _flags(command(name))]
                 where = f"; it is an option of {joined(owners)}" if owners else did_you_mean(unknown, known)
-                if unknown.lstrip("-") in (positional := list(_positional(record))):
+                if unknown.lstrip("-") in (positional := list(_marked(record, tyro.conf.Positional))):
                     where = f"; give it by its place: {program} {' '.join(map(str.upper, positional))}"
                 why = f"{program} has no option {unknown}{where}"
             case _errors.MissingArgs(missing_arguments=missing):
@@ -68,8 +77,32 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
                 why = message
         raise InputError(f"{why} ({program} --help)")
 
+    # tyro also understands -h among the values of an option as a request for help.
+    listed = _as_listed(record, program) if {"-h", "--help"} & {*arguments} else record
     with _errors.on_parse_error(refuse), _plain_descriptions(), _wrapped_paragraphs():
-        return tyro.cli(record, prog=program, args=list(arguments), config=CONFIGURATION)
+        return tyro.cli(listed, prog=program, args=list(arguments), config=CONFIGURATION)
+
+
+def _as_listed(record: Any, program: str) -> Any:
+    """Return the class of a command without the options that the help of another command lists, which it names."""
+    name, hints, hidden, more = (
+        program.removeprefix("jcr "),
+        get_type_hints(record),
+        dict[str, Any](),
+        list[str](),
+    )
+    for command_name, (subject, groups, also) in LISTED_BY.items():
+        if name not in (command_name, *also) and (here := [group for group in groups if group in hints]):
+            hidden |= {group: tyro.conf.Suppress[hints[group]] for group in here}
+            more.append(f"  jcr {command_name} --help  {subject}")
+    if not more:
+        return record
+    about = "\n".join(
+        [inspect.getdoc(record) or "", "", "more options of this command are listed by:", *more]
+    )
+    defaults = {group: dataclasses.field(default_factory=hints[group]) for group in hidden}
+    shorter = type(record.__name__, (record,), {"__annotations__": hidden, "__doc__": about, **defaults})
+    return dataclass(frozen=True, kw_only=True)(shorter)
 
 
 @contextmanager
@@ -96,8 +129,8 @@ def _plain_descriptions() -> Iterator[None]:
 
 
 def _default_hint(label: str) -> str:
-    """Return the default of an option for the help; empty if the default is None or empty."""
-    return "" if label in ("", "None") else f"(default: {label})"
+    """Return the default of an option for the help; empty if it is None or empty, or the option is a flag."""
+    return "" if label in ("", "None", "False", "True") else f"(default: {label})"
 
 
 @contextmanager
@@ -117,20 +150,21 @@ def _wrapped_paragraphs() -> Iterator[None]:
             output.write("\n".join(wrapped))
 
 
-def _positional(record: Any) -> Iterator[str]:
-    """Yield the names of the fields of a command's class that are given by their place."""
+def _marked(record: Any, marker: Any) -> Iterator[str]:
+    """Yield the names of the fields of a class that have a marker of tyro, such as Positional."""
     extra = get_type_hints(record, include_extras=True)
     for field in fields(record):
-        if tyro.conf.Positional in getattr(extra[field.name], "__metadata__", ()):
+        if marker in getattr(extra[field.name], "__metadata__", ()):
             yield field.name
 
 
 def _flags(record: Any) -> Iterator[str]:
     """Yield the names (--NAME) of all options of a command's class, also those of nested classes of options."""
     if is_dataclass(record):
-        hints, positional = get_type_hints(record), {*_positional(record)}
+        hints = get_type_hints(record)
+        no_option = {*_marked(record, tyro.conf.Positional), *_marked(record, tyro.conf.Suppress)}
         for field in fields(record):
-            if field.name in positional:
+            if field.name in no_option:
                 continue
             if is_dataclass(hints[field.name]):
                 yield from _flags(hints[field.name])

@@ -109,7 +109,7 @@ class ExportCommand:
             lines = [facts["line"]]
         pair = run.pair_in_words(row.contents)
         self.output.result(lines, facts | {"intrinsics": pair})
-        for words in (pair, run.root_in_words(row.contents)):
+        for words in (pair, run.root_in_words()):
             if words is not None:
                 sys.stderr.write(f"{words}\n")
         if run.doubt is not None:
@@ -217,7 +217,9 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
         raise InputError(f"{path}: expected three numbers x, y, z (m) in each row")
     points = numbers_of_table(tables[0])
     if not (finite := np.isfinite(points).all(1)).all():
-        raise InputError(f"{path}: point {finite.argmin() + 1} is not finite; remove it")
+        raise InputError(
+            f"{path}: point {finite.argmin() + 1} is not three finite numbers; correct or remove it"
+        )
     return points
 
 

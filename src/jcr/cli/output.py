@@ -2,6 +2,8 @@
 
 import io
 import json
+import os
+import re
 import shutil
 import sys
 import textwrap
@@ -12,10 +14,14 @@ from typing import Any
 from jcr.errors import printable
 from jcr.number_format import INDENT
 
+COLOURS = {"ACCEPTED": 32, "REJECTED": 31, "WARNING": 33}
+"""ANSI codes of the words that state a verdict or a warning at the start of a line: green, red and yellow."""
+COLOURED = re.compile(rf"^({'|'.join(COLOURS)})\b")
+
 
 @dataclass(frozen=True)
 class Output:
-    """Options of a command's output."""
+    """Options of the output."""
 
     json: bool = False
     """Print the result as one JSON object."""
@@ -33,7 +39,7 @@ class Output:
 
 @dataclass(frozen=True)
 class VerboseOutput(Output):
-    """Options of the output of a command that prints details only with --verbose."""
+    """Options of the output, with the details on request."""
 
     verbose: bool = False
     """Also print the details: the uncertainty budget, the use of each image, notes and p-values."""
@@ -43,6 +49,7 @@ def write_lines(lines: Iterable[str]) -> None:
     """Write lines to stdout; on a terminal, those longer than a row are wrapped at words, below the text of a label.
 
     Commands to copy (the line Next, and lines in lower case) are not wrapped; in a file or pipe no line is.
+    On a terminal a verdict or warning at the start of a line is coloured, unless NO_COLOR is set (no-color.org).
     """
     # While progress bars are drawn, stdout is a proxy of rich, which does not tell whether it is a terminal.
     stream = getattr(sys.stdout, "rich_proxied_file", sys.stdout)
@@ -55,6 +62,8 @@ def write_lines(lines: Iterable[str]) -> None:
             rows = textwrap.wrap(
                 line, width, subsequent_indent=" " * indent, break_long_words=False, break_on_hyphens=False
             )
+        if stream.isatty() and not os.environ.get("NO_COLOR"):
+            rows[0] = COLOURED.sub(lambda word: f"\033[1;{COLOURS[word[0]]}m{word[0]}\033[0m", rows[0])
         sys.stdout.writelines(f"{row}\n" for row in rows)
     sys.stdout.flush()
 

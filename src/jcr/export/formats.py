@@ -1,7 +1,7 @@
 """Table of export formats for calibration and map of a run."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import import_module
 from operator import attrgetter
@@ -19,6 +19,7 @@ from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
 from jcr.extras import extra
 from jcr.files import written_whole
+from jcr.findings.finding import joined
 from jcr.geometry import scale_translation, transform
 from jcr.number_format import significant
 from jcr.options import checked_options
@@ -47,39 +48,51 @@ class ExportFormat:
     first argument."""
     contents: str
     """Attributes of `ExportedRun` that are passed to the writer, separated by spaces."""
+    options: str
+    """Options that concern the format, separated by spaces; all formats take `force` and `overwrite`."""
 
 
 TEXTS = ("ros", "simulators")
 """Modules whose writers return a text."""
+CAMERA = "parent_frame child_frame base_frame camera intrinsics"
+"""Options of the formats that contain the transform of one camera to its parent frame."""
+FRAMES = f"{CAMERA} to_root root_from_optical"
+"""Options of the formats that contain frames."""
 # fmt: off
 FORMATS = (
     ExportFormat("ros2", "hand_eye.launch.xml", "static_transform_publisher line and launch file",
-                 "ros.ros2_launch", "mount others"),
+                 "ros.ros2_launch", "mount others", FRAMES),
     ExportFormat("moveit", "hand_eye.launch.py", "launch file as MoveIt Calibration saves it",
-                 "ros.moveit_launch", "mount"),
-    ExportFormat("urdf", "hand_eye.urdf", "camera link and fixed joint", "ros.urdf", "mount others options"),
-    ExportFormat("easy_handeye2", "hand_eye.calib", ".calib for its publisher", "ros.easy_handeye2", "mount path.stem"),
+                 "ros.moveit_launch", "mount", FRAMES),
+    ExportFormat("urdf", "hand_eye.urdf", "camera link and fixed joint", "ros.urdf", "mount others options",
+                 f"{FRAMES} into"),
+    ExportFormat("easy_handeye2", "hand_eye.calib", ".calib for its publisher",
+                 "ros.easy_handeye2", "mount_with_gripper path.stem", FRAMES),
     ExportFormat("camera_info", "camera_info.yaml", "intrinsics for camera_info_manager",
-                 "ros.camera_info", "camera_frame"),
-    ExportFormat("ply", "cloud.ply", "points, colours, labels", "nerfstudio_colmap.write_cloud", "cloud notes"),
-    ExportFormat("glb", "map.glb", "mesh of the seen surface with colours", "planner_maps.write_glb", "scene map_notes"),
+                 "ros.camera_info", "camera_frame", CAMERA),
+    ExportFormat("ply", "cloud.ply", "points, colours, labels",
+                 "nerfstudio_colmap.write_cloud", "cloud notes", "base_frame"),
+    ExportFormat("glb", "map.glb", "mesh of the seen surface with colours",
+                 "planner_maps.write_glb", "scene map_notes", "base_frame"),
     ExportFormat("octomap", "map.bt", "occupied, free and unknown voxels",
-                 "planner_maps.write_octomap", "scene map_notes options"),
-    ExportFormat("esdf", "esdf.npz", "voxels of signed distance", "planner_maps.write_esdf", "scene map_notes options"),
+                 "planner_maps.write_octomap", "scene map_notes options", "base_frame voxel_size"),
+    ExportFormat("esdf", "esdf.npz", "voxels of signed distance",
+                 "planner_maps.write_esdf", "scene map_notes options", "base_frame voxel_size unknown"),
     ExportFormat("spheres", "spheres.npz", "spheres that cover what is solid",
-                 "planner_maps.write_spheres", "scene map_notes options"),
+                 "planner_maps.write_spheres", "scene map_notes options", "base_frame unknown excess"),
     ExportFormat("nerfstudio", "nerfstudio/", "transforms.json, images and first points for a splat or NeRF",
-                 "nerfstudio_colmap.write_nerfstudio", "views cloud notes options"),
+                 "nerfstudio_colmap.write_nerfstudio", "views cloud notes options", "base_frame undistort link_images"),
     ExportFormat("colmap", "colmap/", "COLMAP model in the base frame, binary and text",
-                 "nerfstudio_colmap.write_colmap", "views notes options"),
+                 "nerfstudio_colmap.write_colmap", "views notes options", "base_frame undistort link_images"),
     ExportFormat("depth", "depth/", "depth and colour images with their cameras, for TSDF mappers",
-                 "nerfstudio_colmap.write_depth", "pointmaps views notes options"),
+                 "nerfstudio_colmap.write_depth", "pointmaps views notes options", "base_frame float_depth"),
     ExportFormat("lerobot", "cameras.parquet", "cameras of a LeRobot data set, by episode",
-                 "lerobot.write_lerobot", "episodes notes"),
-    ExportFormat("mjcf", "hand_eye.xml", "camera for MuJoCo", "simulators.mjcf", "mount"),
-    ExportFormat("usd", "hand_eye.usda", "camera for Isaac Sim and others that read USD", "simulators.usd", "mount"),
+                 "lerobot.write_lerobot", "episodes notes", "base_frame"),
+    ExportFormat("mjcf", "hand_eye.xml", "camera for MuJoCo", "simulators.mjcf", "mount", CAMERA),
+    ExportFormat("usd", "hand_eye.usda", "camera for Isaac Sim and others that read USD", "simulators.usd", "mount",
+                 CAMERA),
     ExportFormat("rerun", "run.rrd", "recording for the Rerun viewer",
-                 "planner_maps.write_rrd", "views cloud scene map_notes"),
+                 "planner_maps.write_rrd", "views cloud scene map_notes", "base_frame"),
 )
 # fmt: on
 
@@ -115,10 +128,16 @@ def write_run(
         raise InputError(f"{format}: no such format{did_you_mean(format, names)}; choose {', '.join(names)}")
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
-    if options.to_root and format in ("mjcf", "usd", "lerobot"):
-        raise InputError(f"--to-root: is for files of frames; {format} has the camera itself, leave it out")
-    if options.into is not None and format != "urdf":
-        raise InputError(f"--into {options.into}: is for the format urdf")
+    given = (one.name for one in fields(options) if getattr(options, one.name) != one.default)
+    if (
+        excess := next(
+            (one for one in given if one not in ("force", "overwrite", *row.options.split())), None
+        )
+    ) is not None:
+        takers = joined([one.name for one in FORMATS if excess in one.options.split()])
+        raise InputError(
+            f"--{excess.replace('_', '-')}: the format {format} does not use it, only {takers}; leave it out"
+        )
     # Files of several cameras stand side by side.
     own_name = row.file if options.camera is None else f"{options.camera}_{row.file}"
     path = path or out / "export" / (own_name if options.into is None else options.into.name)
@@ -204,13 +223,18 @@ class ExportedRun:
         Raises InputError also if the name of the gripper frame is needed and unknown.
         """
         mount = self.camera_frame
+        return mount if mount.is_fixed else self.mount_with_gripper
+
+    @property
+    def mount_with_gripper(self) -> ros.CameraMount:
+        """As `mount`, for a format that states the gripper frame also for a fixed camera."""
         # FRAME stands for a name in messages, and is none.
-        if not mount.is_fixed and self.gripper_frame in (None, "FRAME"):
+        if self.gripper_frame in (None, "FRAME"):
             raise InputError(
-                f"{self.run.out}: the capture does not name the gripper frame of its poses, the parent of the camera; "
+                f"{self.run.out}: the capture does not name the gripper frame of its poses, which this format states; "
                 "add --parent-frame FRAME (the frame that the robot reports: tool0, flange, panda_hand, a TCP, …)"
             )
-        return mount
+        return self.camera_frame
 
     @property
     def camera_frame(self) -> ros.CameraMount:
@@ -245,14 +269,10 @@ class ExportedRun:
         rotation = Rotation.from_quat(quat_xyzw).as_matrix()
         return ros.on_root(mount, options.to_root, transform(rotation, np.array([x, y, z])))
 
-    def root_in_words(self, contents: str) -> str | None:
+    def root_in_words(self) -> str | None:
         """Return a sentence on the assumed origin of the camera's root link; None for an export without that link."""
         options = self.options
-        if (
-            options.to_root is None
-            or options.root_from_optical is not None
-            or "mount" not in contents.split()
-        ):
+        if options.to_root is None or options.root_from_optical is not None:
             return None
         return (
             f"{options.to_root} is taken to have its origin in the optical frame's, with x forward; if a driver states "
@@ -276,7 +296,11 @@ class ExportedRun:
                 f"a fraction of a pixel; gripper poses times the hand-eye transform differ from them by "
                 f"{significant(mm)} mm (median), by the robot's errors{other}"
             )
-        camera = self.camera_frame.intrinsics if {"mount", "camera_frame"} & {*contents.split()} else None
+        camera = (
+            self.camera_frame.intrinsics
+            if {"mount", "mount_with_gripper", "camera_frame"} & {*contents.split()}
+            else None
+        )
         if camera is None:
             return None
         words, given = f"belongs to {intrinsics_in_words(camera)}", found.with_given_intrinsics

@@ -16,7 +16,7 @@ ExportName = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Frames, resolution and images of an exported file; each format uses the options that concern it."""
+    """Frames, resolution and images of an exported file; an option that does not concern the format is refused."""
 
     parent_frame: Annotated[str | None, tyro.conf.arg(metavar="FRAME")] = None
     """The gripper frame of the capture's poses; by default the one that the capture names."""
