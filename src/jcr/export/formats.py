@@ -227,7 +227,7 @@ class ExportedRun:
 
     @property
     def mount_with_gripper(self) -> ros.CameraMount:
-        """As `mount`, for a format that states the gripper frame also for a fixed camera."""
+        """Transform as `mount`, for a format that states the gripper frame also for a fixed camera."""
         # FRAME stands for a name in messages, and is none.
         if self.gripper_frame in (None, "FRAME"):
             raise InputError(
