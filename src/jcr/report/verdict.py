@@ -40,13 +40,12 @@ def failure_section(calibration: AnyCalibration) -> Content:
 
 
 def _verdict(calibration: AnyCalibration) -> dict[str, str]:
-    """Return the verdict, its colour ("kind"), its reason, and sentences on leave-one-out error and uncertainty."""
+    """Return verdict, colour ("kind"), reason and remedy, and sentences on leave-one-out error and uncertainty."""
     required, short, verdict = calibration.requirement, calibration.short, calibration.verdict
     kind = {"accepted": "good", "rejected": "bad"}.get(verdict, "fair")
-    if calibration.doubt is not None:
-        reason = calibration.doubt
-    elif short is not None:
-        reason = sentence(short)
+    stated = short if calibration.converged else calibration.findings[0]
+    if stated is not None:
+        reason = stated.text
     else:
         reason = "no check contradicts it" if required is None else reached_in_words(required)
         if corner_is_missed(calibration):
@@ -59,7 +58,14 @@ def _verdict(calibration: AnyCalibration) -> dict[str, str]:
     if isinstance(calibration, Calibration):
         worst = worst_direction(calibration)
         evidence += f" Largest uncertainty of the translation: {worst} (1 σ)."
-    return {"kind": kind, "verdict": verdict.capitalize(), "reason": reason, "evidence": evidence}
+    remedy = "" if stated is None or not stated.remedy else f"Remedy: {stated.remedy}."
+    return {
+        "kind": kind,
+        "verdict": verdict.capitalize(),
+        "reason": reason,
+        "remedy": remedy,
+        "evidence": evidence,
+    }
 
 
 def _leave_one_out(calibration: AnyCalibration) -> str:
