@@ -244,6 +244,21 @@ def test_std_covers_the_errors_of_drawn_calibrations(uncertain: "SceneMap"):
     assert elsewhere[~free].all() and elsewhere.sum() > (~free).sum()
 
 
+def test_a_point_about_which_the_scene_may_be_rotated_is_certain_and_others_move_by_their_lever():
+    from jcr.scene.uncertainty import MapUncertainty
+
+    rng = np.random.default_rng(0)
+    middle, pivot, turn, lever = rng.normal(size=(4, 3))
+    step = np.r_[np.cross(turn, middle - pivot), turn, 0.0]
+    made = MapUncertainty(
+        order=(), joint=np.zeros((0, 0)), middle=middle, similarity=np.outer(step, step), shape_m=0.0,
+        look_std_m=0.0, lower=np.zeros(3), block_m=1.0, depth_std=np.zeros((1, 1, 1)),
+    )  # fmt: skip
+    std = made.surface_std(np.stack([pivot, pivot + lever]), np.tile([[0.0, 0.6, 0.8]], (2, 1)))
+    moved = np.cross(turn, lever)
+    np.testing.assert_allclose(std, [0.0, abs(0.6 * moved[1] + 0.8 * moved[2])], atol=1e-7)
+
+
 def test_the_file_keeps_the_joint_covariance_and_the_answers(uncertain: "SceneMap", tmp_path: Path):
     uncertain.save(tmp_path / "map.safetensors")
     fresh, x = load_map(tmp_path), uniform(2000)
@@ -404,6 +419,17 @@ def test_rays_cross_what_is_before_a_wall_and_hit_the_wall() -> None:
     assert column[4] & HIT
     assert (column[5:] & CROSSED).all()
     assert not (states(False) & CROSSED).any() and (states(False) & HIT).any()
+
+
+def test_what_may_go_on_behind_an_unseen_cell_is_not_crossed() -> None:
+    import torch
+
+    from jcr.scene.seen_space import CROSSED, HIT, SeenGrid, without_doubts
+
+    before, after = ([0, CROSSED, CROSSED | HIT, CROSSED, CROSSED], [0, 0, HIT, CROSSED, CROSSED])  # along z
+    state = torch.tensor(before, dtype=torch.uint8)[:, None, None].repeat(1, 3, 3)
+    found = without_doubts(SeenGrid(torch.zeros(3), 0.01, state)).state
+    assert found[:, 1, 1].tolist() == found[:, 0, 2].tolist() == after
 
 
 def test_priors_make_surfaces_and_nothing_free() -> None:
