@@ -16,7 +16,13 @@ from jcr.calibration.record import Calibration
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added_cameras import added_camera
 from jcr.cell.place_cameras import _adopted, place_cameras
-from jcr.cell.placement import CameraPlacement, CamerasFile, read_cameras, write_cameras
+from jcr.cell.placement import (
+    CameraPlacement,
+    CamerasFile,
+    TransformUncertainty,
+    read_cameras,
+    write_cameras,
+)
 from jcr.cell.rigs import CameraViews, fit_views
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.hypotheses import Examined
@@ -26,7 +32,15 @@ from jcr.estimation.pose_equations import fit_known_scale
 from jcr.estimation.problem import with_observations
 from jcr.estimation.solve import solve
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import inverse, rotation_exp, scale_translation, step_between, transform
+from jcr.geometry import (
+    apply,
+    inverse,
+    retract,
+    rotation_exp,
+    scale_translation,
+    step_between,
+    transform,
+)
 from jcr.records import Capture, CellCamera, Reconstruction
 from jcr.sfm.register import Registration
 from refusal import refused
@@ -126,6 +140,19 @@ def test_a_strain_of_a_second_arm_is_part_of_its_model_and_its_covariance():
         step = step_between(found, best)
         squared.append(step @ np.linalg.solve(covariance, step))
     assert squared[0] > 16.8 > squared[1]  # 99 % of chi2 of 6
+
+
+def test_the_error_of_a_point_of_the_scene_is_that_by_the_steps_of_its_camera():
+    rng, depth_m = np.random.default_rng(0), 0.8
+    pose, root = (
+        transform(rotation_exp(rng.normal(size=3)), rng.normal(size=3)),
+        1e-3 * rng.normal(size=(6, 6)),
+    )
+    point = np.array([0.0, 0.0, depth_m])
+    moved = np.stack([apply(retract(pose, step), point) - apply(pose, point) for step in 1e-6 * np.eye(6)], 1)
+    moved = moved @ root / 1e-6
+    found = TransformUncertainty.of(root @ root.T, pose, depth_m)
+    assert found.at_scene_mm == pytest.approx(1e3 * np.linalg.norm(moved, 2), rel=1e-4)
 
 
 @pytest.fixture(scope="module")

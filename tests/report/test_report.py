@@ -21,7 +21,7 @@ from jcr.geometry import inverse, transform
 from jcr.number_format import decimals_of, significant
 from jcr.records import COVARIANCE_ORDER, CellCamera, Reconstruction
 from jcr.report.html import report_html
-from jcr.report.images import MAGNIFIED
+from jcr.report.images import MAGNIFIED, images_section
 from jcr.report.motion import excitation_bars
 from jcr.result import RunResult
 from jcr.scene.cloud import point_cloud
@@ -184,13 +184,13 @@ def test_page_is_one_small_file(page: str):
 
 
 def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
-    """A camera on the gripper, of whose images one was used, and one on another arm; each where it was."""
+    """A camera on the gripper and one on another arm, of whose images one was used; each where it was then."""
     size, poses = run.capture.image_size, run.capture.base_from_gripper
     mount, base = transform(np.eye(3), np.array([0.0, 0.1, 0.0])), transform(np.eye(3), np.array([1.0, 0, 0]))
     wrist = {"mount": "gripper", "image_size": size}
     others = (
         CellCamera(name="second", images=("a", "b", "c"), frame=np.array([0, 2, UNREGISTERED]), **wrist),
-        CellCamera(name="other", images=("a",), arm="right", base_from_gripper=poses[:1], **wrist),
+        CellCamera(name="other", images=("b", "a"), arm="right", base_from_gripper=poses[:2], **wrist),
     )
     found = [
         CameraPlacement.of(
@@ -212,7 +212,7 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     scene = json.loads(Elements(page).scripts[0])
     drawn = {camera["name"]: np.array(camera["cameras"]) for camera in scene["others"]}
     assert {name: len(places) for name, places in drawn.items()} == {"second": 1, "other": 1}
-    assert np.allclose(drawn["other"][0], (base @ poses[0] @ mount)[:3], atol=1e-6)
+    assert np.allclose(drawn["other"][0], (base @ poses[1] @ mount)[:3], atol=1e-6)
     camera = np.array(scene["views"][0]["camera"] + [[0, 0, 0, 1]])
     expected = camera @ inverse(run.found.gripper_from_camera) @ mount
     assert np.allclose(drawn["second"][0], expected[:3], atol=1e-5)
@@ -255,6 +255,12 @@ def test_reprojections_are_those_of_the_run(run: RunResult, page: str):
     ways = np.array([re.findall(r"l(-?\d+) (-?\d+)", path)[:20] for path in marks], float) / MAGNIFIED
     stated = [image.reprojection_px for image in run.calibration.images if image.reprojection_px]
     assert np.median(np.linalg.norm(ways, axis=-1)) == pytest.approx(np.median(stated), abs=1.5 / MAGNIFIED)
+    # The lines lead from the features to the projections: features that are 3 px too far right have them on the left.
+    tracks = run.reconstruction.tracks
+    right = replace(run.reconstruction, tracks=replace(tracks, x_px=tracks.x_px + [3.0, 0.0]))
+    cards = images_section(run.capture, run.with_parts(reconstruction=right))["cards"]
+    across = [float(x) for card in cards for x in re.findall(r"l(-?\d+) ", card["marks"] or "")]
+    assert np.median(across) == pytest.approx(-3 * MAGNIFIED, abs=5)
     elements = Elements(page)
     assert all(part in elements.text for part in ("left of the tick", "tracked features (red)"))
 
