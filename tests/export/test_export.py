@@ -28,7 +28,13 @@ import jcr
 from in_process import run_jcr
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
-from jcr.cell.placement import CameraPlacement, CamerasFile, TransformUncertainty, write_cameras
+from jcr.cell.placement import (
+    ArmPlacement,
+    CameraPlacement,
+    CamerasFile,
+    TransformUncertainty,
+    write_cameras,
+)
 from jcr.cli import dispatch
 from jcr.errors import RejectedError
 from jcr.export import ros, simulators
@@ -136,6 +142,19 @@ def test_ros_files_hold_the_transform_and_name_frames_and_units(name: str, doubt
     assert ("REJECTED: scale: every view" in first) == (doubt is not None)
 
 
+def test_the_calib_of_a_fixed_camera_names_the_base_as_parent_and_the_gripper_as_effector():
+    fixed = ros.CameraMount(
+        parent="base_link",
+        child="overhead",
+        parent_from_child=PARENT_FROM_CHILD,
+        base="base_link",
+        effector="tool0",
+    )
+    stated = yaml.safe_load(ros.easy_handeye2(fixed, "cell"))["parameters"]
+    names = ("calibration_type", "robot_base_frame", "robot_effector_frame", "tracking_base_frame")
+    assert [stated[name] for name in names] == ["eye_on_base", "base_link", "tool0", "overhead"]
+
+
 def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, tmp_path, capsys):
     content = json.loads((done / "calibration.json").read_text())
     kept = content["with_given_intrinsics"]
@@ -192,6 +211,19 @@ def test_files_of_several_cameras_stand_side_by_side_and_the_hint_names_the_came
     assert "610" in (out / "export" / "fixed0_camera_info.yaml").read_text()
     unnamed = run_jcr("export", out, "easy_handeye2", "--camera", "fixed0")  # states the gripper frame, too
     assert unnamed.returncode == 2 and "add --parent-frame FRAME" in unnamed.stderr
+
+
+def test_the_base_of_another_arm_is_named_after_that_of_the_run(tmp_path: Path):
+    shutil.copy(ROOT / "tests" / "calibrations" / "accepted.json", tmp_path / "calibration.json")
+    spread = TransformUncertainty.of(1e-6 * np.eye(6))
+    arm = ArmPlacement(name="right", base_from_other_base=PARENT_FROM_CHILD.tolist(), uncertainty=spread)
+    write_cameras(tmp_path, CamerasFile(cameras=[], arms=[arm], version=jcr.__version__))
+    names = {"base_frame": "base_link", "parent_frame": "tool0"}
+    _, node = ElementTree.parse(export_run(tmp_path, "ros2", options=names)).getroot().findall("node")
+    words = node.get("args", "").split()
+    stated = dict(zip(words[::2], words[1::2], strict=True))
+    assert (stated["--frame-id"], stated["--child-frame-id"]) == ("base_link", "right_base_link")
+    assert [float(stated[f"--{axis}"]) for axis in "xyz"] == pytest.approx(PARENT_FROM_CHILD[:3, 3])
 
 
 def test_urdf_of_wrist_and_fixed_cameras_of_two_arms_is_one_tree(tmp_path: Path):
