@@ -14,7 +14,7 @@ from PIL import Image
 
 import jcr
 from jcr.calibration.calibrate import calibrate_reconstruction
-from jcr.calibration.drift import Located, Reference, check_series, step_of
+from jcr.calibration.drift import Change, Located, Reference, Step, check_series, step_of
 from jcr.calibration.record import write_calibration
 from jcr.camera import project
 from jcr.capture.formats import capture_json
@@ -42,6 +42,7 @@ from jcr.pipeline.calibrated_scene import OldScene
 from jcr.pipeline.stages import begun, keep_reconstruction
 from jcr.pipeline.touch import CLICK_PX, error_covariance, touch
 from jcr.pipeline.verify import TOLERANCE, of_two_poses
+from jcr.pipeline.verify_history import History, Verified, without_part
 from jcr.records import Capture, RobotNoise, Uncertainty
 from jcr.result import RunOptions, RunResult
 from jcr.sfm.register import Registration
@@ -295,6 +296,24 @@ def test_a_start_check_in_python_counts_an_image_once(out: Path, capture: Captur
     assert [row.name for row in run.verify(files[10:12], poses[10:12]).history] == ["start", "next"]
 
 
+def test_a_change_goes_with_the_capture_that_showed_it_where_more_images_take_its_place():
+    step = Step(step=np.zeros(6), covariance=np.eye(6), p_value=1.0)
+    facts = {
+        "images": ("0.png",),
+        "located": None,
+        "camera": step,
+        "scene": step,
+        "detectable": (1.0, 1.0),
+        "odds": 1.0,
+    }
+    rows = tuple(Verified(name=name, digests=(name,), **facts) for name in ("monday", "tuesday"))
+    changes = tuple(Change(cause="camera", first=0, named=k) for k in range(2))
+    history = History(calibration="c", captures=rows, changes=changes)
+    assert without_part(history, ["wednesday"]) == history
+    before = without_part(history, ["tuesday", "more"])
+    assert before.captures == rows[:1] and [one.named for one in before.changes] == [0]
+
+
 def test_the_poses_that_tell_most_are_those_of_the_run(done: Path, capsys):
     assert dispatch(["verify", str(done), "--check-poses", "--json"]) == 0
     poses = json.loads(capsys.readouterr().out)["poses"]
@@ -465,7 +484,7 @@ def test_what_is_no_list_of_touched_points_is_refused(done: Path, tmp_path: Path
 def test_the_expected_errors_of_a_touch_are_those_of_its_click_depth_and_pose():
     """The p-value is uniform: errors drawn from the truth are as large as expected."""
     rng, count, draws = np.random.default_rng(0), 6, 400
-    x = transform(rotation_exp(np.array([0.1, -0.2, 0.3])), np.array([0.03, -0.02, 0.06]))
+    x = transform(rotation_exp(np.array([1.1, -0.7, 0.9])), np.array([0.03, -0.02, 0.06]))
     gripper = gripper_poses("varied", 3, np.array([0.5, 0.0, 0.0]), x, rng)[np.arange(count) // 2]
     in_camera = rng.uniform([-0.15, -0.1, 0.4], [0.15, 0.1, 0.6], (count, 3))
     noise = RobotNoise(translation=1e-3, rotation=np.radians(0.2), estimated=True)
