@@ -18,6 +18,7 @@ from jcr.capture.pairing import (
     stamp_ns,
     stamps_of_names,
 )
+from jcr.capture.pose_track import NEVER, interpolated_poses
 from refusal import refused
 from simulation.problems import hand_eye_problem
 
@@ -132,6 +133,14 @@ def test_time_stamps_pair_to_the_nanosecond(name: str, column: str):
     np.testing.assert_allclose(at_images[:, 0, 3], np.arange(5) + 0.125, atol=1e-9)
     assert note is None and not stale.any()
     assert poses_at_images(poses, found, 500.0, "p.csv")[1].all(), "samples two seconds apart are too far"
+
+
+def test_a_stamp_at_a_sample_has_no_gap_and_one_outside_of_the_samples_has_no_end():
+    times, poses = np.array([0, 10, 30]), np.tile(np.eye(4), (3, 1, 1))
+    poses[:, 0, 3] = [1.0, 2.0, 6.0]
+    found, gap = interpolated_poses(times, poses, np.array([-1, 0, 5, 10, 25, 30, 31]))
+    assert found[:, 0, 3].tolist() == [1.0, 1.0, 1.5, 2.0, 5.0, 6.0, 6.0]
+    assert gap.tolist() == [NEVER, 0, 10, 0, 20, 0, NEVER]
 
 
 def resting() -> tuple[np.ndarray, np.ndarray]:
