@@ -15,6 +15,7 @@ from jcr.camera import NORMALIZED
 from jcr.cli import dispatch
 from jcr.geometry import ROOT_FROM_OPTICAL, inverse, retract, rotation_exp, transform
 from jcr.number_format import significant
+from jcr.records import JointOffsets
 from jcr.report.verdict import head
 from places import ROOT
 
@@ -47,6 +48,21 @@ def test_what_is_no_covariance_is_refused(change: str, tmp_path: Path, capsys: p
         assert dispatch([str(word) for word in command]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert "calibration.json" in line and words in line
+
+
+def test_robot_errors_are_in_millimetres_and_degrees_in_the_file():
+    found = read_calibration(ACCEPTED)
+    assert isinstance(found, Calibration)
+    left = 2e-3, np.radians(0.5)
+    noise = replace(found.robot_noise, systematic=float(np.radians(0.25)), systematic_left=left)
+    joints = JointOffsets(offset=np.radians([1.0, -2.0]), std=np.radians([0.1, 0.2]), prior_std=0.01)
+    stated = replace(found, robot_noise=noise, joint_offsets=joints).as_json()["robot_errors"]
+    sizes = [stated[name] for name in ("systematic_deg", "translation_mm", "rotation_deg")]
+    assert sizes == pytest.approx([0.25, 2.0, 0.5])
+    assert [list(one.values()) for one in stated["joints"]] == [
+        pytest.approx([1.0, 0.1]),
+        pytest.approx([-2.0, 0.2]),
+    ]
 
 
 def test_the_error_of_a_mixed_pair_is_that_of_the_rays():

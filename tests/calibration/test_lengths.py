@@ -21,7 +21,7 @@ from jcr.depth.depth_camera import with_measured_depth
 from jcr.files import write_bytes
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.geometry import apply, inverse, rotation_exp, step_between, transform
-from jcr.records import MATCHED, PRIOR, Capture, Intrinsics, Reconstruction, Tracks
+from jcr.records import MATCHED, PRIOR, Capture, DepthCheck, Intrinsics, Reconstruction, Tracks
 from refusal import refused
 from scenes import capture_of, maps_of, no_depth, reconstruction_of
 from simulation.boards import Sheet, with_sheet
@@ -65,6 +65,22 @@ def test_a_board_that_agrees_with_the_robot_makes_the_scale_more_certain():
     assert np.allclose(
         np.sum(list(vars(both.uncertainty.budget).values()), axis=0), both.covariance, rtol=0, atol=1e-9
     )
+
+
+def test_the_stated_error_of_the_depth_images_refers_to_the_scale_that_a_board_has_changed(monkeypatch):
+    alone = calibrated_alone(0).scale
+
+    def off_percent(scale: float) -> float:
+        return 100 * (1.004 * alone / scale - 1)
+
+    def measured(_: Capture, __: Reconstruction, hand_eye: Calibration) -> DepthCheck:
+        facts = {"noise_m": 0.0, "noise_per_m": 0.0, "distances_m": (0.4, 0.8), "images": 12, "features": 500}
+        return DepthCheck(off_percent=off_percent(hand_eye.scale), std_percent=0.1, **facts)
+
+    monkeypatch.setattr("jcr.calibration.checks.lengths.depth_check", measured)
+    found, _ = calibrated(Sheet())
+    assert found.depth_check is not None and abs(off_percent(found.scale) - 0.4) > 0.01
+    assert found.depth_check.off_percent == pytest.approx(off_percent(found.scale), abs=1e-6)
 
 
 @pytest.mark.parametrize("pose_scale", [1.015, 0.95])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import GRASPING, CalibrateOptions, RequiredAccuracy
 from jcr.calibration.record import Calibration, validated
-from jcr.calibration.required_accuracy import advised
+from jcr.calibration.required_accuracy import advised, requirement_of
 from jcr.calibration.summary import summary
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run_calibrate_batch import show, show_calibration
@@ -81,6 +81,23 @@ def test_the_images_that_are_missing_are_counted():
     few = calibrate_pose_pairs(pairs(12, 3)[0], out_of_reach)
     assert few.requirement is not None and few.requirement.more_images == 5, "no forecast from three images"
     assert validated(json.loads(json.dumps(content.as_json())), Path("a")) == content
+
+
+def test_the_images_to_add_suffice_for_translation_and_rotation():
+    given, _ = pairs(12, 12)
+    found = calibrate_pose_pairs(given)
+    reached, parts = found.requirement, (found.gripper_from_camera, found.uncertainty, (), 12)
+    assert reached is not None
+
+    def more(of_mm: float, of_deg: float) -> int | None:
+        asked = CalibrateOptions(require=(of_mm * reached.reached_mm, of_deg * reached.reached_deg))
+        required, _ = requirement_of(*parts, asked)
+        return None if required is None else required.more_images
+
+    far, near = more(0.75, 2.0), more(2.0, 0.95)
+    assert far and near and far > near and more(0.75, 0.95) == far
+    far, near = more(2.0, 0.75), more(0.95, 2.0)
+    assert far and near and far > near and more(0.95, 0.75) == far
 
 
 @pytest.mark.parametrize(("share", "severity"), [(0.2, "informs"), (0.5, "warns")])

@@ -24,6 +24,7 @@ from jcr.estimation.intrinsics_prior import (
     size_of,
 )
 from jcr.estimation.point_uncertainty import (
+    bounds_at,
     point_covariance,
     point_in_base,
     scene_points,
@@ -291,6 +292,14 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
     in_camera = drawn @ x[:3, :3]
     for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)):
         assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
+
+
+def test_a_rotation_about_the_ray_of_a_pixel_moves_neither_its_point_nor_the_ray():
+    x, ray = hand_eye_problem(np.random.default_rng(0), 3).gripper_from_camera, unproject(INTRINSICS, X_PX[1])
+    step = np.r_[np.zeros(3), 1e-3 * x[:3, :3] @ ray / np.linalg.norm(ray), 0.0]
+    found = bounds_at(x, Uncertainty(covariance=np.outer(step, step)), INTRINSICS, X_PX[1], DISTANCE_M)
+    assert (found.within_95_mm, found.ray_95_deg) == pytest.approx((0.0, 0.0), abs=1e-5)
+    assert found.rotation_95_deg == pytest.approx(np.degrees(1.96e-3), rel=0.01)
 
 
 def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
