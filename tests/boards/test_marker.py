@@ -12,17 +12,18 @@ import pytest
 import jcr
 import scenes
 from jcr.backends import ReconstructOptions, reconstruct
-from jcr.boards.detection import boards
+from jcr.boards.corners import with_boards
+from jcr.boards.detection import PRINTED_STD, Sighting, boards
 from jcr.boards.marker import reconstruct_marker
 from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.difference import compare
-from jcr.camera import unproject
+from jcr.camera import project, unproject
 from jcr.capture.formats import capture_json
 from jcr.capture.images import encode_png
 from jcr.capture.read import read_capture
 from jcr.files import write_bytes
 from jcr.findings import FindingKind
-from jcr.geometry import inverse, rotation_between_deg, rotation_exp, step_between, transform
+from jcr.geometry import apply, inverse, rotation_between_deg, rotation_exp, step_between, transform
 from jcr.pipeline.backend_selection import select_reconstruction
 from jcr.records import CellCamera, Intrinsics
 from jcr.result import RunOptions
@@ -124,6 +125,9 @@ def test_calibrates_from_tags(tmp_path):
     deg = rotation_between_deg(found[:3, :3], gripper_from_camera[:3, :3])
     assert hand_eye.converged and mm < 1.0 and deg < 0.2, f"{mm} mm, {deg}°"
     assert abs(hand_eye.scale - 1) < 0.005
+    # The size of the tags is a prior of the scale, and no length that a network predicted.
+    assert reconstruction.metric_std == PRINTED_STD
+    assert "network" not in {one.name for one in hand_eye.lengths}
 
 
 @pytest.mark.parametrize(("spec", "legacy", "read_as"), [
@@ -222,6 +226,26 @@ def test_a_chessboard_with_a_narrow_border_before_a_dark_background_is_found_whe
     expected = cv2.perspectiveTransform(inner[None], turned)[0]
     apart = np.linalg.norm(sighting.x_px[:, None] - expected, axis=2)
     assert max(apart.min(0).max(), apart.min(1).max()) < 0.5
+
+
+def test_a_corner_that_only_one_image_shows_takes_the_place_of_no_other(tmp_path: Path, monkeypatch):
+    capture, gripper_from_camera = capture_of(tmp_path / "capture", charuco, count=3)
+    cameras, corners = (
+        capture.base_from_gripper @ gripper_from_camera,
+        np.indices((3, 2, 1)).reshape(3, -1).T * 0.03,
+    )
+    seen = list[list[Sighting]]()
+    for camera, first in zip(cameras, (0, 1, 1), strict=True):
+        x = corners[first:]
+        x_px = project(INTRINSICS, apply(inverse(camera), TARGET_IN_BASE + x))
+        seen.append([Sighting(0, tuple(range(first, len(corners))), x, x_px)])
+    monkeypatch.setattr("jcr.boards.corners.most_seen", lambda readings, _: (readings[0], seen))
+    made = scenes.reconstruction_of(cameras, intrinsics=INTRINSICS)
+    tracks = with_boards(capture, made, "charuco:7x6:0.030:0.022:DICT_4X4_50").tracks
+    assert tracks.boards is not None
+    (body,) = tracks.boards.bodies
+    assert len(body.point) == len(corners) - 1
+    np.testing.assert_allclose(tracks.points_in_recon[body.point], TARGET_IN_BASE + body.x_in_body, atol=1e-5)
 
 
 def test_an_unknown_intrinsics_comes_from_the_board(tmp_path):
