@@ -26,7 +26,7 @@ from jcr.cli.check_verify_compare import CheckCommand, _command_of_remedy
 from jcr.cli.map_query_export_view import PRINTED_POINTS, read_points
 from jcr.cli.output import write_lines
 from jcr.findings import Finding, FindingKind
-from jcr.geometry import scale_translation, transform
+from jcr.geometry import rotation_exp, scale_translation, transform
 from jcr.live.session import SessionOptions
 from jcr.number_format import INDENT, labelled
 from jcr.pipeline import run
@@ -277,15 +277,16 @@ def test_a_rejected_check_prints_the_command_with_the_option_that_reads_the_pose
 
 
 def test_compared_calibrations_agree_or_differ(tmp_path: Path):
-    for name, x_m in (("a", 0.0), ("b", 0.0003), ("c", 0.17)):
-        pose = transform(np.eye(3), np.array([x_m, 0.05, 0.1]))
+    for name, x_m, deg in (("a", 0.0, 0.0), ("b", 0.0003, 0.1), ("c", 0.17, 0.0), ("d", 0.0, 2.0)):
+        pose = transform(rotation_exp(np.array([0.0, np.radians(deg), 0.0])), np.array([x_m, 0.05, 0.1]))
         errors = {"std_mm": [0.5] * 3, "std_deg": [0.1] * 3}
         content = {"gripper_from_camera": pose.tolist()} | errors
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
-    close, far = (run_jcr("compare", "a.json", f"{name}.json", cwd=tmp_path) for name in "bc")
+    close, far, turned = (run_jcr("compare", "a.json", f"{name}.json", cwd=tmp_path) for name in "bcd")
     assert close.returncode == 0 and close.stdout.startswith("AGREE: 0.300 mm")
     assert far.returncode == 3 and far.stdout.startswith("DIFFER: 170.000 mm")
     assert "of the same camera and gripper frame" in far.stdout
+    assert turned.returncode == 3 and turned.stdout.startswith("DIFFER: 0.000 mm, 2.0000° apart")
 
 
 def test_a_comparison_with_a_rejected_calibration_decides_nothing_and_names_no_cause():
