@@ -91,6 +91,15 @@ def test_commands_take_retake_remove_and_undo(tmp_path: Path, tabletop: Path):
     assert left == ["001.png", "002.png", "003.png"]
 
 
+def test_the_changes_of_a_closed_capture_cannot_be_undone(tmp_path: Path, tabletop: Path):
+    """Their images are deleted: an undone removal would name a file that is not there."""
+    folder = LiveFolder(tmp_path / "c")
+    name = folder.add(still(tabletop, 0), poses(tabletop)[0])
+    folder.remove(name)
+    folder.close()
+    assert not folder.can_undo and not folder.undo() and frames_in(tmp_path / "c") == []
+
+
 def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path: Path, tabletop: Path):
     taken = Stepped(tmp_path / "c", tabletop)
 
@@ -260,6 +269,12 @@ def test_a_ur_arm_is_asked_for_wherever_it_rests(tabletop: Path, length: int):
             last = state.base_from_gripper
             assert np.allclose(last, goal, atol=1e-9)
             assert state.joints is not None and np.allclose(state.joints, joints)
+
+
+def test_an_arm_whose_clock_is_set_back_rests_again_half_a_second_later():
+    times = [10.0, 10.2, *(0.1 * k for k in range(10))]
+    found = next_rest(lambda: (RobotState(time_s, np.eye(4)) for time_s in times), None, MOVED_ON)
+    assert found.time_s == 0.5
 
 
 def test_what_is_no_ur_robot_is_one_line(monkeypatch: pytest.MonkeyPatch):
