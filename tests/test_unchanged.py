@@ -99,8 +99,15 @@ def test_the_second_run_makes_nothing(format: str, capture: Capture, tmp_path, m
     assert again.out.splitlines()[1:] == said.out.splitlines()[1:]
     assert stamps_of(out) == stamps
     assert seconds < SECONDS
-    dispatch([*command, "--require", "50", "9"])
-    assert "unchanged" not in capsys.readouterr().err and made == ["colmap"], "other options, same cameras"
+
+
+def test_other_options_of_the_calibration_keep_the_cameras(
+    capture: Capture, tmp_path, made: list[str], capsys
+):
+    command = ["run", str(capture.folder), str(tmp_path), "--no-map", "--backend", "colmap"]
+    for options in ([], ["--require", "50", "9"]):
+        dispatch([*command, *options])
+        assert "unchanged" not in capsys.readouterr().err and made == ["colmap"]
 
 
 @pytest.mark.parametrize("format", ["poses.csv", "bag"])
