@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 import capture_writers as writers
 import jcr
-from jcr.capture.frame_choice import best_frames
+from jcr.capture.frame_choice import UNREADABLE, best_frames
 from jcr.capture.images import encode_png, read_image
 from jcr.capture.options import ReadOptions
+from jcr.capture.pose_track import TfTree
 from jcr.capture.ros_messages import image_of, read_ros_depth
 from jcr.records import Capture, FrameNames
 from refusal import refused
@@ -284,6 +285,7 @@ def test_the_best_frames_are_still_sharp_and_spread():
     speed = np.tile([0.2, 0.1, *[0.001] * 6, 0.1, 0.2], 40)
     sharp = np.ones(400)
     sharp[10:60] = 0.2  # five of the views
+    sharp[60:70] = UNREADABLE  # another one, which is not called blurred
     asked = []
 
     def sharpness_of(rows):
@@ -303,6 +305,18 @@ def test_the_best_frames_are_still_sharp_and_spread():
     # Only where the arm never stops are moving frames taken, and said to be.
     rows, notes = best_frames(poses, speed + 0.05, np.ones(400, bool), lambda rows: sharp[rows], 8)
     assert len(rows) == 8 and "stands still at 0 different views where 8" in notes[-1]
+    assert (speed[rows] < 0.005).all(), "the slowest frames between stops"
+
+
+def test_the_latest_of_the_static_transforms_of_a_frame_counts():
+    tree, zero = TfTree(), {"y": 0.0, "z": 0.0}
+    for sec, x in ((2, 0.2), (3, 0.3), (1, 0.1)):
+        header = SimpleNamespace(frame_id="base", stamp=SimpleNamespace(sec=sec, nanosec=0))
+        at, turned = SimpleNamespace(x=x, **zero), SimpleNamespace(x=0.0, **zero, w=1.0)
+        moved = SimpleNamespace(translation=at, rotation=turned)
+        tree.add([SimpleNamespace(header=header, child_frame_id="tool0", transform=moved)], static=True)
+    poses, gap = tree.poses_at("base", "tool0", Path("bag"))(np.array([0, 10**10]))
+    assert poses[:, 0, 3].tolist() == [0.3, 0.3] and gap.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_rggb8", "bayer_gbrg8", "yuv422_yuy2"])

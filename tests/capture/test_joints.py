@@ -26,6 +26,12 @@ def test_forward_kinematics_agree_with_a_hand_computation(tmp_path: Path):
     arm = arm_of(tmp_path, URDF)
     assert arm.joints == ("pan", "lift", "roll")
     np.testing.assert_allclose(arm.poses(angles, ""), arm_poses(angles), atol=1e-12)
+    # From a link in the middle, the joints before it are another arm's.
+    ahead = read_arm(ReadOptions(urdf=tmp_path / "arm.urdf", gripper_frame="upper"))
+    behind = arm_of(tmp_path, URDF, base_frame="upper")
+    assert (ahead.joints, behind.joints) == (("pan",), ("lift", "roll"))
+    whole = ahead.poses(angles[:, :1], "") @ behind.poses(angles[:, 1:], "")
+    np.testing.assert_allclose(whole, arm_poses(angles), atol=1e-12)
 
 
 @pytest.mark.parametrize(("options", "words"), [
