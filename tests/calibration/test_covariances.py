@@ -162,6 +162,7 @@ def test_p_values_of_drawn_differences_are_uniform_and_shares_sum_to_one():
         found = compare(StatedTransform(X, parts), StatedTransform(retract(X, step), parts))
         values.append(found.p_value)
         assert sum(found.explained_by.values()) == pytest.approx(1.0)
+    assert found.sigmas == pytest.approx(np.abs(step) / np.sqrt(np.diag(2 * robot + 2 * images)))
     assert abs(np.mean(np.array(values) < 0.5) - 0.5) < 0.09
     assert np.mean(np.array(values) < 0.05) < 0.09
 

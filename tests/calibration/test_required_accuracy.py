@@ -100,13 +100,17 @@ def test_the_images_to_add_suffice_for_translation_and_rotation():
     assert far and near and far > near and more(0.95, 0.75) == far
 
 
-@pytest.mark.parametrize(("share", "severity"), [(0.2, "informs"), (0.5, "warns")])
-def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(share: float, severity: str):
+@pytest.mark.parametrize(
+    ("share", "by_rotation", "severity"), [(0.2, 0.0, "informs"), (0.5, 0.0, "warns"), (0.0, 0.5, "warns")]
+)
+def test_a_motion_below_a_third_of_a_points_bound_is_no_warning(
+    share: float, by_rotation: float, severity: str
+):
     given, _ = pairs(12, 12)
     found = calibrate_pose_pairs(given)
     size = {
-        "value": 1e-3 * share * found.requirement.reached_mm, "rotation": 0.0, "count": 6.0,
-        "longer": "after",
+        "value": 1e-3 * share * found.requirement.reached_mm, "count": 6.0, "longer": "after",
+        "rotation": by_rotation * found.requirement.reached_mm / found.requirement.distance_mm,
     }  # fmt: skip
     moved = found.with_findings(Finding.of(FindingKind.SLIP, "warns", "mount", *given.images[5:7], **size))
     again = advised(moved, given.base_from_gripper, CalibrateOptions())

@@ -54,6 +54,9 @@ FILES = {
     "opencv.yml": "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n  rows: 3\n  cols: 3\n  dt: d\n  data: "
     "[500., 0., 320., 0., 501., 240., 0., 0., 1.]\ndistortion_coefficients: !!opencv-matrix\n  rows: 1\n  cols: 5\n"
     "  dt: d\n  data: [0.1, -0.2, 0.001, 0.002, 0.]\nimage_width: 640\nimage_height: 480\n",
+    # As Open3D writes it: by columns.
+    "open3d.json": '{"width": 640, "height": 480, "intrinsic_matrix": [500, 0, 0, 0, 501, 0, 320, 240, 1], '
+    '"dist_coeffs": [0.1, -0.2, 0.001, 0.002, 0]}',
     "matrix.txt": MATRIX,
 }
 

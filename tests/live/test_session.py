@@ -100,6 +100,14 @@ def test_the_changes_of_a_closed_capture_cannot_be_undone(tmp_path: Path, tablet
     assert not folder.can_undo and not folder.undo() and frames_in(tmp_path / "c") == []
 
 
+def test_joints_that_some_images_lack_are_not_written(tmp_path: Path, tabletop: Path):
+    folder = LiveFolder(tmp_path / "c")
+    for k, joints in enumerate(([0.1] * 6, None)):
+        folder.add(still(tabletop, k), poses(tabletop)[k], joints=joints)
+        frames = json.loads((tmp_path / "c" / "capture.json").read_text())["frames"]
+        assert ["joints" in frame for frame in frames] == [[True], [False, False]][k]
+
+
 def test_a_connection_that_fails_during_retake_does_not_end_the_capture(tmp_path: Path, tabletop: Path):
     taken = Stepped(tmp_path / "c", tabletop)
 
