@@ -18,7 +18,7 @@ from jcr.estimation.pose_equations import pose_residuals
 from jcr.estimation.problem import BASE_ROTATION, ROTATION, SCALE, LinearPrior
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import ARM, Poses, Transform, transform
-from jcr.records import Excitation, Observability
+from jcr.records import Observability
 
 MIN_SPREAD = 0.1
 """Smallest assumed spread of camera centres (m), for a capture with nearly equal centres."""
@@ -26,6 +26,9 @@ WEAK = 0.06
 """Excitation below which a direction is weakly observable; motion 3° off a degenerate one gives 0.03 to 0.05."""
 EXACT = 0.005
 """Excitation below which a direction is unobservable, whatever the measurement errors."""
+Excitation = tuple[Float[ndarray, "7"], Float[ndarray, "7 7"]]
+"""Excitation of each direction, weakest first, and the directions as rows: unit vectors of translation (m), rotation
+times ARM, and log scale times the rms distance (m) of the camera centres from their mean."""
 
 
 def excitation(
@@ -55,7 +58,7 @@ def excitation(
     for one in priors:
         seen += np.outer(one.row[:7], one.row[:7])
     squared, vectors = np.linalg.eigh(seen)
-    return Excitation(np.sqrt(np.maximum(squared, 0.0)), vectors.T, spread)
+    return np.sqrt(np.maximum(squared, 0.0)), vectors.T
 
 
 def observability(
@@ -74,19 +77,19 @@ def observability(
     n = len(base_from_gripper)
     if n == 2:
         return Observability((_unseen("two images"),))
-    found = excitation(base_from_gripper, gripper_from_camera, priors)
+    value, direction = excitation(base_from_gripper, gripper_from_camera, priors)
     # Few images have low excitation by chance: three general ones as low as twenty with 3° of deviation.
     few = min(1.0, (n - 2) / 4)
-    unseen = found.value < WEAK * few
+    unseen = value < WEAK * few
     if not unseen.any():
         return Observability()
-    findings = _explained(base_from_gripper, recon_from_camera, found, unseen)
-    if found.value[0] >= EXACT * few:
+    findings = _explained(base_from_gripper, recon_from_camera, direction, unseen)
+    if value[0] >= EXACT * few:
         # A weak direction has a standard deviation, by which hand_eye.judged decides; the finding only explains it.
         findings = [
             replace(one, severity="warns", details={**one.details, "nearly": 1.0}) for one in findings
         ]
-    return Observability(tuple(replace(one, value=float(found.value[0])) for one in findings))
+    return Observability(tuple(replace(one, value=float(value[0])) for one in findings))
 
 
 def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "") -> Finding:
@@ -101,9 +104,12 @@ def _unseen(motion: str, at: Float[ndarray, "3"] | None = None, frame: str = "")
 
 
 def _explained(
-    base_from_gripper: Poses, recon_from_camera: Poses | None, found: Excitation, unseen: Bool[ndarray, "7"]
+    base_from_gripper: Poses,
+    recon_from_camera: Poses | None,
+    direction: Float[ndarray, "7 7"],
+    unseen: Bool[ndarray, "7"],
 ) -> list[Finding]:
-    """Return findings that name the degenerate motion; `unseen` masks weak directions of `found`.
+    """Return findings that name the degenerate motion; `unseen` masks the weak rows of `direction`.
 
     Without `recon_from_camera`, an orbit about the scene is not distinguished from rotations about a tool point.
     """
@@ -112,14 +118,14 @@ def _explained(
     still = np.sqrt(np.maximum(1 - length**2, 0.0)) < WEAK
     if still.all():
         return [_unseen("no rotation")]
-    loses_scale = np.abs(found.direction[unseen][:, 6]).max() > 0.2
+    loses_scale = np.abs(direction[unseen][:, 6]).max() > 0.2
     if still.any():
         if unseen.sum() == 1 and not loses_scale:
             return [_unseen("planar", u[:, 0], "base")]
         parts = ("translation", "scale", "rotation")[: max(int(unseen.sum()), 2)]
         return [_unseen(f"one axis, {part}", u[:, 0], "base") for part in parts]
     if not loses_scale:
-        translation, rotation = found.direction[0][:3], found.direction[0][3:6]
+        translation, rotation = direction[0][:3], direction[0][3:6]
         is_translation = np.linalg.norm(translation) >= np.linalg.norm(rotation)
         axis = translation if is_translation else rotation
         what = "translation" if is_translation else "rotation"

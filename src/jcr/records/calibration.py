@@ -77,18 +77,6 @@ class Observability:
         return tuple(finding.remedy for finding in self.findings)
 
 
-@dataclass(frozen=True)
-class Excitation(Checked):
-    """Directions of translation, rotation and scale, sorted by how strongly the motions excite (determine) each."""
-
-    value: Float[ndarray, "7"]
-    """Excitation of each direction, weakest first."""
-    direction: Float[ndarray, "7 7"]
-    """Directions as rows: unit vectors of translation (m), rotation times ARM, and log scale times `spread`."""
-    spread: float
-    """Root mean square distance (m) of the camera centres from their mean."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class RobotNoise(Checked):
     """Robot errors: random noise of the gripper poses, one sigma per axis, and systematic errors."""

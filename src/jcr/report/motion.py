@@ -5,9 +5,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jcr.calibration.summary import given_in_words, seen_in_words
-from jcr.estimation.observability import WEAK, excitation
+from jcr.estimation.observability import WEAK, Excitation, excitation
 from jcr.number_format import significant
-from jcr.records import Excitation
 from jcr.report.render import Content
 from jcr.result import RunResult
 
@@ -66,7 +65,7 @@ def excitation_bars(found: Excitation) -> Iterator[tuple[str, str, float, str]]:
     The direction that the motions determine least comes first. The name lists the direction's components above 0.4, the
     number is its excitation, and an excitation of 0.4 or more has length 100.
     """
-    for value, direction in zip(found.value, np.abs(found.direction), strict=True):
+    for value, direction in zip(found[0], np.abs(found[1]), strict=True):
         parts = [COMPONENTS[k] for k in np.argsort(-direction) if direction[k] > NAMED_FROM]
         name = ", ".join(parts) or COMPONENTS[int(direction.argmax())]
         kind = "used" if value >= WEAK else "rejected"
