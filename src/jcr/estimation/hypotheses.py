@@ -96,9 +96,8 @@ class Test:
     """Covariance of the estimate."""
     log_p: float
     """Log p-value: chance of such an estimate without the effect, times the number of places tested."""
-    shift: Float[ndarray, " p"]
-    """Change when the effect is estimated too: of the camera's pose (m, rad; axes of its parent) and of log scale, 7
-    numbers; of all p unknowns in the result of `confirm_in_equations`."""
+    shift: Float[ndarray, "7"]
+    """Change when the effect is estimated too: of the camera's pose (m, rad; axes of its parent) and of log scale."""
     noise: RobotNoise
     """Robot pose noise estimated together with the effect."""
     solution: Solution | None = None
@@ -216,9 +215,7 @@ def confirm(model: Examined, effect: Effect) -> Test:
     `model`, which raises LinAlgError if it is singular.
     """
     if not effect.of_camera:
-        test = confirm_in_equations(model.solution.equations, effect, arm=model.arm or 0)
-        own = test.shift[columns_of_arm(model.arm or 0)[:6]]
-        return replace(test, shift=np.r_[own, 0.0])
+        return confirm_in_equations(model.solution.equations, effect, model.arm or 0)
     after = model.with_effects(*model.effects, effect)
     assert model.camera is not None
     problem, solution, d = after.solution.problem, after.solution, effect.columns.shape[1]
@@ -254,15 +251,12 @@ def squared_length(vector: Float[ndarray, " d"], covariance: Float[ndarray, "d d
     return float(whitened @ whitened), int(kept.sum())
 
 
-def confirm_in_equations(
-    equations: Equations, effect: Effect, freedom: float | None = None, arm: int = 0
-) -> Test:
+def confirm_in_equations(equations: Equations, effect: Effect, arm: int) -> Test:
     """Return Wald's test of an effect on the poses: an F test of its parameters, averaged over the error sizes.
 
     The rows of `effect.columns` are those of `equations.residual`. The average weighs each choice of the sizes by its
-    posterior (`over_sizes`). `Test.shift` is the change of all p unknowns, in the order of `equations`. `freedom` is
-    the denominator's degrees of freedom of each F test; None: those of all residuals, which is conservative. `arm` is
-    the arm whose noise the result has.
+    posterior (`over_sizes`). The denominator's degrees of freedom are those of all residuals, which is conservative.
+    `arm` is the arm whose noise and shift the result has; log scale counts as unchanged.
     """
     count, d = equations.jacobian.shape[1], effect.columns.shape[1]
     free = replace(
@@ -274,7 +268,7 @@ def confirm_in_equations(
     likeliest, information = most_likely(free)
     found = solve_equations(free, likeliest)
     without = solve_equations(equations, likeliest)
-    under = float(max(len(equations.residual) - UNKNOWNS - d, 1)) if freedom is None else freedom
+    under = float(max(len(equations.residual) - UNKNOWNS - d, 1))
     log_shares = []
     # Few poses determine the sizes badly, and with larger sizes the same estimate is less significant.
     for weight, _, each in over_sizes(free, likeliest, information, arm=arm):
@@ -287,7 +281,7 @@ def confirm_in_equations(
         estimate=found.step[count:],
         covariance=found.covariance[count:, count:],
         log_p=float(np.logaddexp.reduce(np.concatenate(log_shares)) + np.log(effect.places)),
-        shift=found.step[:count] - without.step,
+        shift=np.r_[(found.step[:count] - without.step)[columns_of_arm(arm)[:6]], 0.0],
         noise=free.noise(likeliest, arm),
     )
 
