@@ -176,12 +176,7 @@ class Equations:
         """Index of the size of the random part, and of the systematic part, of each of s residuals in `LogSizes`."""
         arm = np.zeros(len(self.residual) // 6, int) if self.arm is None else self.arm
         first = OF_ARM * np.repeat(arm, 6)
-        return first + (self.of_position == 0), first + 2
-
-    @cached_property
-    def of_position(self) -> Float[ndarray, " s"]:
-        """Mask of the s residuals: 1.0 for a position component (m), 0.0 for a rotation component (rad)."""
-        return np.tile(np.repeat([1.0, 0.0], 3), len(self.residual) // 6)
+        return first + np.tile(np.repeat([0, 1], 3), len(arm)), first + 2
 
     def of_poses(self, poses: Int[ndarray, " k"]) -> "Equations":
         """Return the equations of k of the n poses; `poses` are their numbers."""
