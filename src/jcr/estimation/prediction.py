@@ -16,11 +16,10 @@ from jcr.estimation.intrinsics_prior import camera_about
 from jcr.estimation.pixel_noise import PixelNoise
 from jcr.estimation.point_uncertainty import seen_points
 from jcr.estimation.problem import wrist_arm, wrist_problem
-from jcr.estimation.robot_noise import GIVEN_SHARE, TYPICAL
 from jcr.estimation.solve import uncertainty_of, with_covariance
 from jcr.geometry import Poses, Transform, nearest_to_lines, transform
 from jcr.least_squares import one_blas_thread
-from jcr.records import Capture, Intrinsics, RobotNoise, Tracks, Uncertainty
+from jcr.records import Capture, Intrinsics, Tracks, Uncertainty
 
 MIN_PREDICTED_IMAGES = 3
 """Smallest number of poses for a prediction."""
@@ -49,13 +48,7 @@ def predict(
     `systematic` (6n,6n) is the covariance of the poses' systematic errors for a size σ_s of 1 rad. Its order is pose by
     pose: translation (m), then rotation vector (rad), in base axes.
     """
-    gripper, sizes = capture.base_from_gripper, np.array(TYPICAL)
-    if noise is not None:
-        sizes[:2] = np.hypot(1.0, GIVEN_SHARE) * np.array(noise)
-    metres, radians, systematic_rad = sizes.tolist()
-    expected = RobotNoise(
-        translation=metres, rotation=radians, estimated=False, given=noise, systematic=systematic_rad
-    )
+    gripper = capture.base_from_gripper
     intrinsics = capture.intrinsics or guessed_intrinsics(capture.image_size)
     # Distortion is set to 0, since it may fold over outside the image; its value hardly matters for its uncertainty.
     straight = parameters(intrinsics)
@@ -82,7 +75,7 @@ def predict(
     )
     images = image_evidence(problem, state)
     images.information[np.diag_indices(len(images.information))] += UNCONNECTED
-    found = with_covariance(problem, state, images, expected=expected)
+    found = with_covariance(problem, state, images, expected=True)
     uncertainty = uncertainty_of(found)
     seen = seen_points(x, uncertainty, found.problem.intrinsics(found.state)[0], distance_m)
     return x, replace(uncertainty, seen=seen)

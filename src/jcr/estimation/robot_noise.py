@@ -91,8 +91,6 @@ GIVEN_SHARE = 0.3
 """Middle of the prior on random errors in addition to a given noise, as a share of it."""
 SHOWN = 1.1
 """Factor on a given noise above which the noise is reported as estimated from the residuals."""
-LEAST_BESIDE = 0.01
-"""Smallest random errors in addition to a given noise, as a share of it; the logarithm of 0 is not finite."""
 RATIO_STD = np.log(4.0)
 """Prior standard deviation of log(σ_t / (REACH · σ_r)); with log 2, 95 % regions of three images hold 80 to 90 %."""
 LEVELS = tuple(1.5 * np.arange(-4, 5))
@@ -167,6 +165,12 @@ class Equations:
         return rows, np.r_[np.log(typical) / std, np.full(arms, np.log(REACH) / RATIO_STD)], std
 
     @property
+    def typical(self) -> Float[ndarray, " c"]:
+        """Middle of the prior on the log sizes, in the order of `LogSizes`."""
+        middle, std = self.prior[1:]
+        return middle[: len(std)] * std
+
+    @property
     def arms(self) -> int:
         """Number of arms."""
         return 1 if self.arm is None else int(self.arm.max()) + 1
@@ -201,15 +205,6 @@ class Equations:
         for first in range(0, OF_ARM * self.arms, OF_ARM):
             variances[..., first : first + 2] += self.least**2
         return variances
-
-    def log_sizes_of(self, noise: RobotNoise) -> Float[ndarray, "3"]:
-        """Return log σ_t, log σ_r and log σ_s of a noise record, for one arm: the inverse of the method `noise`.
-
-        The squared bounds `least` are subtracted. Each σ is at least LEAST_BESIDE times its bound.
-        """
-        squared = np.square([noise.translation, noise.rotation]) - self.least**2
-        beside = np.sqrt(np.maximum(squared, (LEAST_BESIDE * self.least) ** 2))
-        return np.log(np.r_[beside, max(noise.systematic, LEAST_BESIDE * float(self.least[1]))])
 
     def random(self, log_sizes: LogSizes) -> Float[ndarray, "*k s"]:
         """Return the variance of the random part of each of s residuals: m² for position, rad² for rotation."""
@@ -355,8 +350,7 @@ def most_likely(
         some = equations.of_poses(np.linspace(0, poses - 1, MOST_FOR_SIZES).astype(int))
         at, information = most_likely(some, start, settled)
         return at, poses / MOST_FOR_SIZES * information
-    middle, std = equations.prior[1:]
-    at = middle[: len(std)] * std if start is None else start
+    at = equations.typical if start is None else start
     value, gradient, information = score(equations, at)
     curvature = information
     for _ in range(40):

@@ -372,26 +372,25 @@ def with_covariance(
     state: State,
     images: ImageEvidence | None,
     averaged: bool = True,
-    expected: RobotNoise | None = None,
+    expected: bool = False,
 ) -> Solution:
     """Return the solution with its covariance, from the most likely state and the evidence of the images.
 
-    `images` None: camera poses are given. `averaged` is that of `solve`. `expected` is the assumed robot noise of a
-    predicted solution, whose residuals are 0; None: the noise is estimated.
+    `images` None: camera poses are given. `averaged` is that of `solve`. `expected`: the solution is
+    predicted, its residuals are 0, and the sizes of the robot's errors are typical ones instead of estimates.
     """
     poses = pose_equations(problem, state, images)
     equations = poses.equations
-    if expected is None:
-        log_sizes, information = most_likely(equations, state.robot_log_sizes)
+    if expected:
+        log_sizes, information = equations.typical, score(equations, equations.typical)[2]
     else:
-        log_sizes = equations.log_sizes_of(expected)
-        information = score(equations, log_sizes)[2]
+        log_sizes, information = most_likely(equations, state.robot_log_sizes)
     state = likeliest = replace(state, robot_log_sizes=log_sizes)
     at_mode = solve_equations(equations, log_sizes)
     covariance, budget = at_mode.covariance, None
     if averaged:
         step, covariance, budget = posterior(
-            equations, log_sizes, at_mode, information, poses.region, expected is not None
+            equations, log_sizes, at_mode, information, poses.region, expected
         )
         state = full_step(problem, state, step)
     return Solution(
