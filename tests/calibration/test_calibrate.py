@@ -16,7 +16,7 @@ from jcr.calibration.robot_errors import errors_of
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
 from jcr.estimation.intrinsics_prior import camera_about
-from jcr.estimation.problem import scale_prior
+from jcr.estimation.problem import PoseModel, scale_prior
 from jcr.geometry import inverse, retract, step_between, transform
 from places import ROOT
 from scenes import capture_of, reconstruction_of
@@ -75,7 +75,7 @@ def test_cameras_that_were_placed_with_a_wrong_focal_length_are_within_sigma_onc
             capture=capture_of(problem.base_from_gripper, intrinsics=given),
             reconstruction=reconstruction_of(np.array(camera), intrinsics=given, tracks=tracks),
             options=CalibrateOptions(), robot=errors_of(problem.base_from_gripper),
-            priors=(scale_prior(problem.scale, 1e-3),), fit=solved, numbers=solved,
+            pose_model=PoseModel(priors=(scale_prior(problem.scale, 1e-3),)), fit=solved, numbers=solved,
             model=Model(tracks=tracks, used=solved.inliers, camera=camera_about(given, True)),
         )  # fmt: skip
         whole = adjusted(case).numbers

@@ -82,7 +82,7 @@ def solution_of(case: Case, model: Model) -> Solution:
         effects=model.effects,
     )
     priors = list(model.lengths)
-    for row, value, std in case.priors:
+    for row, value, std in case.pose_model.priors:
         is_scale = bool(row[SCALE].item())
         # The size of a board is a length, which is compared with the robot's positions before it becomes a prior.
         if not is_scale or model.tracks.boards is None:

@@ -131,13 +131,11 @@ def fitted_case(
         )
     gripper, metric_std, found = capture.base_from_gripper[rows], reconstruction.metric_std, list[Finding]()
     height = options.known_height
-    priors = () if height is None else (offset_prior(*height_cue(gripper, height / 1e3)),)
-
     assumed = PoseModel(
         camera_covariance=None if evidence is None else evidence.covariance,
         error_covariance=robot.systematic,
         noise_floor=options.robot_noise_m_rad,
-        priors=priors,
+        priors=() if height is None else (offset_prior(*height_cue(gripper, height / 1e3)),),
         carries="scene" if capture.mount == "base" else "camera",
     )
     camera = reconstruction.recon_from_camera if evidence is None else evidence.recon_from_camera
@@ -150,8 +148,8 @@ def fitted_case(
         if is_accepted and abs(off) >= max(share, sigmas * float(np.hypot(std, metric_std))):
             size = {"value": float(np.expm1(off)), "std": std}
             found.append(Finding.of(FindingKind.BOARD_SIZE, "rejects", "poses", **size))
-        priors = (scale_prior(1.0, metric_std), *priors)
-        fit = fit_poses(gripper, camera, names, replace(assumed, priors=priors))
+        assumed = replace(assumed, priors=(scale_prior(1.0, metric_std), *assumed.priors))
+        fit = fit_poses(gripper, camera, names, assumed)
     fit = replace(fit, intrinsics=reconstruction.intrinsics.with_std(None))
     model = Model(tracks=reconstruction.tracks, used=fit.inliers, camera=camera_of(capture, reconstruction))
     return Case(
@@ -159,7 +157,7 @@ def fitted_case(
         reconstruction=reconstruction,
         options=options,
         robot=robot,
-        priors=priors,
+        pose_model=assumed,
         fit=fit,
         model=model,
         numbers=fit,

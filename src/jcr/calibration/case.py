@@ -87,8 +87,8 @@ class Case:
     options: CalibrateOptions
     robot: RobotErrorPrior
     """Prior covariance of the systematic errors of the registered images' gripper poses."""
-    priors: tuple[LinearPrior, ...] = ()
-    """Known scale and known height of the camera, which complement the robot's poses; empty if none is given."""
+    pose_model: PoseModel = PoseModel()
+    """Assumptions of a fit to the poses of the registered images, with priors on known scale and camera height."""
     fit: Calibration
     """Fit to camera poses, the initial estimate of the bundle adjustment, with the findings of its motions."""
     model: Model
@@ -139,18 +139,6 @@ class Case:
     def names(self) -> list[str]:
         """Names of the registered images."""
         return [self.capture.images[row] for row in self.reconstruction.image_index]
-
-    @property
-    def pose_model(self) -> PoseModel:
-        """Assumptions of a fit to the poses of the registered images."""
-        evidence = self.reconstruction.evidence
-        return PoseModel(
-            camera_covariance=None if evidence is None else evidence.covariance,
-            error_covariance=self.robot.systematic,
-            noise_floor=self.options.robot_noise_m_rad,
-            priors=self.priors,
-            carries=self.carries,
-        )
 
     @cached_property
     def calibration(self) -> Calibration:

@@ -24,6 +24,7 @@ from jcr.cell.placement import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hypotheses import arm_effects
 from jcr.estimation.problem import Effect, PoseModel, ReportedPoses, State, scale_prior, wrist_arm
+from jcr.estimation.robot_noise import of_poses
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Transform, inverse, motion_length, scale_translation, step_between
 from jcr.records import CellCamera, Intrinsics
@@ -260,10 +261,7 @@ class Rigs:
         """
         case = self.case
         rows = np.array(list(self.rig_of))
-        poses, systematic = (
-            case.capture.base_from_gripper[rows],
-            case.pose_model.of(case.used).error_covariance,
-        )
+        poses, systematic = case.capture.base_from_gripper[rows], of_poses(case.robot.systematic, case.used)
         if len(rows) > len(self.rows):
             systematic = robot_errors(case.capture, case.options).of(rows).systematic
         own = replace(wrist_arm(poses, systematic), carries=case.carries)

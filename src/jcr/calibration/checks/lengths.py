@@ -83,7 +83,7 @@ def check_lengths(case: Case) -> Case:
         for one in lengths
         if of_images and pair is None and one.std < WORTH * robot.std and sigmas((one, robot)) < AGREES
     ]
-    compared = any(one.name != "network" for one in lengths) or bool(case.priors)
+    compared = any(one.name != "network" for one in lengths) or bool(case.pose_model.priors)
     alone = not compared and case.reconstruction.metric_std is None
     findings = [Finding.of(FindingKind.SCALE_FROM_ROBOT, "informs")] * alone
     if pair is not None:
