@@ -64,12 +64,6 @@ def pose_misfit(base_from_gripper: Poses, recon_from_camera: Poses, share: float
     return Misfit(metres, radians, x, z)
 
 
-def pair_angles(a_from_b: Poses) -> Float[ndarray, "n n"]:
-    """Return the rotation angles (rad) between all pairs of n poses; the formula is imprecise near 0 and π."""
-    flat = a_from_b[:, :3, :3].reshape(-1, 9)
-    return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
-
-
 def angle_gap(gripper_angles: Float[ndarray, "n n"], camera_angles: Float[ndarray, "n n"]) -> float:
     """Return the typical difference (rad) of the angles by which gripper and camera turn between the same two images.
 

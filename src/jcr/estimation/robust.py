@@ -19,7 +19,7 @@ from jcr.estimation.closed_form import closed_form, initial_estimate
 from jcr.estimation.problem import PoseModel, State, pose_problem
 from jcr.estimation.robot_noise import MOST_FOR_SIZES
 from jcr.estimation.solve import Solution, solve, with_covariance
-from jcr.geometry import ARM, Poses, Rotations, Transform, inverse, sine_axis
+from jcr.geometry import ARM, Poses, Transform, inverse, sine_axis
 
 Images = Bool[ndarray, " n"]
 """Mask of the used images."""
@@ -157,7 +157,7 @@ def least_trimmed(base_from_gripper: Poses, recon_from_camera: Poses) -> tuple[I
     """
     n = len(base_from_gripper)
     keep = max(4, int(np.ceil(SHARE_RIGHT * n)))
-    triples = _congruent_triples(base_from_gripper[:, :3, :3], recon_from_camera[:, :3, :3])
+    triples = _congruent_triples(base_from_gripper, recon_from_camera)
     x, scale, z = closed_form(base_from_gripper[triples], recon_from_camera[triples], rounds=0)
     error = np.full((len(triples), n), np.inf)
     for k in np.flatnonzero(scale > 0):
@@ -202,16 +202,19 @@ def _squared_error(
     return (gap[..., 3] ** 2).sum(1) + ARM**2 * (gap[..., :3] ** 2).sum((1, 2)) / 2
 
 
-def _congruent_triples(gripper: Rotations, camera: Rotations) -> Int[ndarray, "h 3"]:
+def pair_angles(a_from_b: Poses) -> Float[ndarray, "n n"]:
+    """Return the rotation angles (rad) between all pairs of n poses; those near 0 and π are wrong by 1e-8."""
+    flat = a_from_b[:, :3, :3].reshape(-1, 9)
+    return np.arccos(np.clip((flat @ flat.T - 1) / 2, -1, 1))
+
+
+def _congruent_triples(gripper: Poses, camera: Poses) -> Int[ndarray, "h 3"]:
     """Return h triples of images between which gripper and camera turn by the most similar angles, best first.
 
-    `gripper` and `camera` (n,3,3) are the rotations of the poses. Rows of the result are image numbers.
+    Rows of the result are image numbers.
     """
     n = len(gripper)
-    # The trace of RᵢᵀRⱼ for all pairs; its arccos is wrong by 1e-8 rad near 0, far below `typical`.
-    traces = (flat @ flat.T for flat in (gripper.reshape(n, 9), camera.reshape(n, 9)))
-    of_gripper, of_camera = (np.arccos(np.clip((trace - 1) / 2, -1, 1)) for trace in traces)
-    gap = np.abs(of_gripper - of_camera)
+    gap = np.abs(pair_angles(gripper) - pair_angles(camera))
     if n * (n - 1) * (n - 2) > 6 * MOST_TRIPLES:
         drawn = np.sort(np.random.default_rng(0).integers(n, size=(MOST_TRIPLES, 3)), axis=1)
         i, j, k = drawn[(np.diff(drawn, axis=1) > 0).all(1)].T
@@ -220,8 +223,9 @@ def _congruent_triples(gripper: Rotations, camera: Rotations) -> Int[ndarray, "h
         i, j, k = np.nonzero((row[:, None, None] < row[:, None]) & (row[:, None] < row))
     worst = np.maximum(np.maximum(gap[i, j], gap[i, k]), gap[j, k])
     # Motions about one axis do not determine X, so triples with two different axes are preferred.
-    back = np.swapaxes(gripper[i], 1, 2)
-    spread = np.linalg.norm(np.cross(sine_axis(back @ gripper[j]), sine_axis(back @ gripper[k])), axis=1)
+    rotation = gripper[:, :3, :3]
+    back = np.swapaxes(rotation[i], 1, 2)
+    spread = np.linalg.norm(np.cross(sine_axis(back @ rotation[j]), sine_axis(back @ rotation[k])), axis=1)
     # The 0.3 quantile comes from pairs of correct images even if 30 % of the images are wrong.
     typical = max(float(np.quantile(gap[np.triu_indices(n, 1)], 0.3)), np.radians(0.05))
     order = np.argsort(worst / typical + 0.02 / np.maximum(spread, 1e-6), kind="stable")[:MAX_TRIPLES]
