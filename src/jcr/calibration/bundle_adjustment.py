@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jcr.calibration.case import Case, Model
+from jcr.calibration.case import MIN_IMAGES, Case, Model
 from jcr.calibration.hand_eye import image_verdicts, leave_one_out, transforms
 from jcr.calibration.record import Calibration
 from jcr.calibration.verdict import with_uncertainty
@@ -35,11 +35,12 @@ from jcr.records import COVARIANCE_ORDER, JointCovariance, PaperResiduals, Uncer
 def adjusted(case: Case) -> Case:
     """Return the case after the bundle adjustment of its model, or with the fit to camera poses if that fails.
 
-    A rejected fit is replaced too, because without given intrinsics its camera poses are poor. If the case is not
-    adjustable (`Case.is_adjustable`), the fit is kept. The uncertainty of the principal point is then added to the
-    covariance of a fit to a network's camera poses.
+    A rejected fit is replaced too, because without given intrinsics its camera poses are poor. The fit is kept
+    for camera poses with a covariance (`evidence`), fewer than MIN_IMAGES used images, and fewer observations than
+    unknowns. The uncertainty of the principal point is then added to the covariance of a fit to a network's camera
+    poses.
     """
-    if case.is_adjustable:
+    if case.reconstruction.evidence is None and len(case.used) >= MIN_IMAGES and case.model.is_determined:
         with suppress(np.linalg.LinAlgError):
             return solved(case, case.model)
     elif case.reconstruction.predicted_focal is not None:

@@ -189,25 +189,6 @@ class Case:
         return float(np.median(self.solution.images.view.depth)) * self.solution.state.scale
 
     @property
-    def is_adjustable(self) -> bool:
-        """Whether bundle adjustment can refine the fit to camera poses.
-
-        It needs MIN_IMAGES used images and more observations than unknowns (`Model.is_determined`). Camera poses with a
-        covariance (`evidence`) are not adjusted.
-        """
-        is_free = self.reconstruction.evidence is None
-        return is_free and len(self.used) >= MIN_IMAGES and self.model.is_determined
-
-    @property
-    def shows_camera(self) -> bool:
-        """Whether effects on the camera, such as rolling shutter, can be tested.
-
-        The case must be adjustable (`is_adjustable`), and its motions observable. Tracks from pointmaps are excluded,
-        because the network used intrinsics of its own.
-        """
-        return self.is_adjustable and not self.model.tracks.from_pointmaps and self.observable
-
-    @property
     def observable(self) -> bool:
         """Whether the motions of the used images determine every direction, if only weakly."""
         return self.calibration.observability.observable

@@ -138,7 +138,8 @@ def check_effects(case: Case) -> Case:
         with suppress(np.linalg.LinAlgError):
             if case.solution is not None:
                 longer = replace(longer, solution=solution_of(case, longer.model))
-    if longer.solution is None or not case.shows_camera:
+    # Of tracks from pointmaps the camera is not tested: the network used intrinsics of its own.
+    if longer.solution is None or case.model.tracks.from_pointmaps:
         poses = case.base_from_gripper, case.recon_from_camera
         found = effects_of_fit(*poses, case.calibration, case.names, case.pose_model)
         return case.found(*found)
