@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from jcr import __version__
 from jcr.calibration.case import MATERIAL, Case, Model, camera_of
-from jcr.calibration.checks.effects import LARGE_MOTION, as_adopted, effects, straight_shift
+from jcr.calibration.checks.effects import LARGE_MOTION, effects, straight_shift
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
 from jcr.calibration.robot_errors import robot_errors
@@ -208,7 +208,7 @@ def _adopted(
     strains = [one for one in kept if not one.of_camera]
     for one in faults:
         if one.kind.row.group == "camera":
-            one = as_adopted(one)
+            one = replace(one, shift=None, intrinsics_shift=None)
         elif strains and one.kind is strains[0].kind:
             bent = np.concatenate([each.unit * each.columns for each in strains], axis=1)
             shift = straight_shift(solution, bent)[columns_of_arm(strains[0].part)[:6]]

@@ -526,7 +526,7 @@ def _remaining(found: Finding, after: Case) -> Finding:
     assert after.solution is not None
     strains, solution = [one for one in after.model.effects if not one.of_camera], after.solution
     if found.kind.row.group == "camera":
-        return as_adopted(found)
+        return replace(found, shift=None, intrinsics_shift=None)
     if found.kind not in (one.kind for one in strains):
         return found
     # The shift due to all effects of the arm together belongs to the first finding.
@@ -552,11 +552,6 @@ def as_remark(found: Finding, moved: Float[ndarray, "6"], image_size: tuple[int,
     corner_px = float(np.hypot(*image_size)) / 2 * abs(found.value or 0.0)
     is_tiny = found.kind in FOCUS and corner_px < TINY_PX and max(metres, radians) < TINY
     return replace(found, severity="informs") if is_tiny else found
-
-
-def as_adopted(found: Finding) -> Finding:
-    """Return the finding of an effect that the calibration includes: its shifts (also of the intrinsics) are removed."""
-    return replace(found, shift=None, intrinsics_shift=None)
 
 
 def straight_shift(solution: Solution, columns: Float[ndarray, "s b"]) -> Float[ndarray, " p"]:
