@@ -122,13 +122,16 @@ class _Search:
     def match_by_quarters(self, pairs: Sequence[Key], found: Gate) -> Gate:
         """Match pairs with the second image rotated by 0, 90, 180 and 270° until the hand-eye rotation is known.
 
-        At most GUESSED_AT_MOST pairs are matched. Returns the pairs, classified by the gripper; `found` is the
-        classification before.
+        At most GUESSED_AT_MOST pairs are matched, each only at the rotations that the gripper's angle allows. Returns
+        the pairs, classified by the gripper; `found` is the classification before.
         """
+        # Camera and gripper rotate by the same angle, and one image is rolled against the other by this angle at most.
+        most = {key: float(rotation_angle(self.motion[key][:3, :3])) + math.pi / 4 for key in pairs}
         for start in range(0, min(len(pairs), GUESSED_AT_MOST), GUESSED_AT_ONCE):
             for quarter in range(4):
-                guess = (0.0, quarter * math.pi / 2)
-                self.match(dict.fromkeys(pairs[start : start + GUESSED_AT_ONCE], guess))
+                guess, roll = (0.0, quarter * math.pi / 2), min(quarter, 4 - quarter) * math.pi / 2
+                some = pairs[start : start + GUESSED_AT_ONCE]
+                self.match({key: guess for key in some if roll <= most[key]})
             found = self.classify()
             if found.of_x is not None:
                 break
