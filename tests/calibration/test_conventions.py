@@ -5,12 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy import ndarray
 
+from jcr.calibration.checks import convention
 from jcr.calibration.checks.convention import MIRRORED, better_reading
 from jcr.capture.notations import numbers_of, poses_of
 from jcr.capture.pairing import AS_NUMBERS, AS_TEXT
+from jcr.estimation.pose_misfit import Misfit, pose_misfit
 from jcr.findings import FindingKind, sentence
-from jcr.geometry import inverse
+from jcr.geometry import inverse, rotation_exp
 from jcr.records import Reading
 from scenes import MISTAKES
 from simulation.problems import hand_eye_problem
@@ -72,6 +75,25 @@ def test_the_order_counts_images_without_a_camera_pose():
 def test_sound_poses_are_left_alone(noise):
     problem = hand_eye_problem(np.random.default_rng(0), 10, robot_noise=noise)
     assert better_reading(problem.base_from_gripper, problem.recon_from_camera) == ()
+
+
+def test_poses_of_another_capture_are_not_fitted_in_readings_whose_angles_differ(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """The angles of gripper and camera rule out each reading before it is fitted."""
+    fitted = list[int]()
+
+    def counting(*poses: ndarray) -> Misfit:
+        fitted.append(1)
+        return pose_misfit(*poses)
+
+    monkeypatch.setattr(convention, "pose_misfit", counting)
+    gripper = hand_eye_problem(np.random.default_rng(8), 20).base_from_gripper
+    turned = np.stack([rotation_exp(one) for one in np.random.default_rng(9).normal(size=(20, 3))])
+    cameras = hand_eye_problem(np.random.default_rng(10), 20).recon_from_camera
+    cameras[:, :3, :3] = turned
+    assert better_reading(gripper, cameras, rows=np.arange(20)) == ()
+    assert len(fitted) == 1  # the given poses
 
 
 def test_a_wrong_name_or_option_is_found_by_the_readings_it_ruled_out():

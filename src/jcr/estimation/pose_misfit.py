@@ -18,6 +18,9 @@ MM_PER_DEG = 5.0
 MAX_NOISE = (0.02, float(np.radians(3.0)))
 """Largest error per axis (m, rad) of a working robot. Servo arms have less, so that larger errors mean that poses and
 images do not belong together."""
+NO_ROBOT = float(2 * np.sqrt(3) * MAX_NOISE[1])
+"""Difference (rad) of the angles of gripper and camera above which poses cannot be those of a working robot: both images
+have the largest error on three axes."""
 
 
 class Misfit(NamedTuple):

@@ -22,7 +22,7 @@ from jcr.capture.readings import text_of, undecided
 from jcr.cell.moving_parts import with_moving_parts
 from jcr.errors import InputError, RejectedError, count_of, first_few
 from jcr.estimation.observability import observability
-from jcr.estimation.pose_misfit import MAX_NOISE, MM_PER_DEG, NO_FIT, Misfit, angle_gap, pose_misfit
+from jcr.estimation.pose_misfit import MM_PER_DEG, NO_FIT, NO_ROBOT, Misfit, angle_gap, pose_misfit
 from jcr.estimation.robust import pair_angles
 from jcr.geometry import Poses, inverse, rotation_angle
 from jcr.number_format import significant
@@ -35,9 +35,6 @@ FEWEST_TO_DECIDE = 5
 """Smallest number of images by which a reading is taken; four fit some of a hundred readings by chance."""
 SAME_ROW = 1e-3
 """Largest difference (m, and of the entries of a rotation) of two poses of an arm at rest."""
-NO_ROBOT = float(2 * np.sqrt(3) * MAX_NOISE[1])
-"""Difference (rad) of the angles of gripper and camera above which poses cannot be those of a working robot: both images
-have the largest error on three axes."""
 FITTED_ANYWAY = 10
 """Number of readings that are fitted although none can be that of a robot, so that a message says how far off it is."""
 MOST_CHOICES = 3000
