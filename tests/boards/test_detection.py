@@ -50,6 +50,14 @@ def test_a_board_that_no_image_shows_is_searched_thoroughly_in_few_images(colour
     assert len(searches) == passes * PROBED
 
 
+def test_a_quick_test_that_is_mistaken_costs_one_thorough_search_only():
+    board, searches = counted(boards(SPEC)[0])
+    mistaken = iter([False, True] + [False] * 100)
+    images = [background(seed) for seed in range(3000, 3020)]
+    _, seen = most_seen([replace(board, glance=lambda _: next(mistaken))], images)
+    assert not any(seen) and len(searches) == PROBED + 1
+
+
 @pytest.mark.parametrize("shown", [(3, 14), (0, 5), (17,)])
 def test_a_board_that_few_images_show_is_found_in_each(shown: Sequence[int]):
     board, searches = counted(boards(SPEC)[0])

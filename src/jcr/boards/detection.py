@@ -307,8 +307,8 @@ def _kept(board: Board, of: Callable[[UInt8[ndarray, "h w"]], Result], grey: UIn
 def _searched(board: Board, grey: Sequence[UInt8[ndarray, "h w"]]) -> list[list[Sighting]]:
     """Return the detections of a board in each grey image.
 
-    All images are searched thoroughly if the board is in one of PROBED images, or if its quick test succeeds in any
-    image. Otherwise the board is taken as absent from the others.
+    All images are searched thoroughly if the board is detected in one of PROBED images, or in one in which its quick
+    test succeeds. Otherwise the board is taken as absent from the others.
     """
     found = dict[int, list[Sighting]]()
     if (glance := board.glance) is not None:
@@ -316,8 +316,9 @@ def _searched(board: Board, grey: Sequence[UInt8[ndarray, "h w"]]) -> list[list[
             np.linspace(0, len(grey) - 1, min(PROBED, len(grey))).round().astype(int)
         ).tolist():
             found[k] = _kept(board, board.detect, grey[k])
-        others = (image for k, image in enumerate(grey) if k not in found)
-        if not any(found.values()) and not any(_kept(board, glance, image) for image in others):
+        # The quick test may succeed in an image where corners of another board look like this one.
+        others = (image for k, image in enumerate(grey) if k not in found and _kept(board, glance, image))
+        if not any(found.values()) and not any(_kept(board, board.detect, image) for image in others):
             return [[] for _ in grey]
     return [found[k] if k in found else _kept(board, board.detect, image) for k, image in enumerate(grey)]
 
