@@ -39,6 +39,7 @@ from scenes import capture_of
 from simulation.problems import hand_eye_problem
 
 CALIBRATIONS = ROOT / "tests" / "calibrations"
+TABLETOP = str(ROOT / "examples" / "tabletop")
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +83,15 @@ def test_what_decides_is_named_quiet_or_not(tmp_path: Path, capsys: pytest.Captu
     assert dispatch(export) == 0
     printed = capsys.readouterr()
     assert printed.err.startswith("warning: the calibration is rejected") and printed.err.count("\n") == 1
+
+
+def test_answers_from_the_map_of_a_rejected_run_end_with_3(done: Path, tmp_path: Path):
+    out = shutil.copytree(done, tmp_path / "out")
+    shutil.copy(CALIBRATIONS / "rejected.json", out / "calibration.json")
+    np.save(tmp_path / "points.npy", np.zeros((1, 3)))
+    found = run_jcr("query", out, tmp_path / "points.npy")
+    assert found.returncode == 3 and found.stderr.startswith("error: answers rejected: ")
+    assert found.stdout.startswith("wrote ")
 
 
 @pytest.mark.parametrize(("arguments", "words"), [
@@ -229,6 +239,15 @@ def test_objects_are_measured_to_three_percent(done: Path, tabletop: Path):
     (["run", "nowhere", "out"], "nowhere"),
     (["run", "nowhere", "out", "--backend", "magic"], "auto, colmap, da3, da3-small, direct, "),
     (["compare", "nowhere", "nowhere"], "nowhere"),
+    (["calibrate", TABLETOP, ""], "an argument of jcr calibrate is empty"),
+    (["calibrate", TABLETOP, "out", "--scale", "0.5"], "scale: is for camera poses without images"),
+    (["calibrate", TABLETOP, "out", "--frames", "5"], "--frames is for bags and data sets"),
+    (["run", TABLETOP, "out", "--cell", "0"], "cell 0: give metres, above 0 and up to 0.1"),
+    (["run", TABLETOP, "out", "--max-points", "-5"], "max_points -5"),
+    (["run", TABLETOP, "out", "--confidence-percentile", "200"], "confidence_percentile 200"),
+    (["run", TABLETOP, "out", "--max-seconds", "-1"], "max_seconds -1"),
+    (["run", TABLETOP, "out", "--steps", "5"], "is for the preset paper"),
+    (["run", TABLETOP, "out", "--object-gap", "-1"], "object_gap -1"),
 ])  # fmt: skip
 def test_wrong_arguments_are_one_line_and_exit_2(tmp_path: Path, arguments: list[str], words: str):
     finished = run_jcr(*arguments, cwd=tmp_path)
@@ -325,6 +344,12 @@ def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path
     (tmp_path / "0.jpg").touch()
     wrong = run_jcr("check", tmp_path / "0.jpg")
     assert wrong.returncode == 2 and "0.jpg: is one image; name the folder" in wrong.stderr
+    for header in ("x,y,height", "x_mm,y_mm,z_mm"):
+        (tmp_path / "points.csv").write_text(f"{header}\n0,0,0\n")
+        with refused("name them x, y, z and give metres"):
+            read_points(tmp_path / "points.csv")
+    (tmp_path / "points.csv").write_text("y_m,z_m,x_m\n2,3,1\n5,6,4\n")
+    assert read_points(tmp_path / "points.csv").tolist() == [[1, 2, 3], [4, 5, 6]]
     assert [file.name for file in tmp_path.iterdir()].count("out") == 0
 
 

@@ -179,6 +179,10 @@ def test_files_name_the_intrinsics_that_their_transform_belongs_to(done: Path, t
         assert last.startswith(f"belongs to fx {intrinsics['fx']:.1f}") and "--intrinsics given" in last
     export(done, "colmap", tmp_path / "colmap")
     assert "mm (median), by the robot's errors" in capsys.readouterr().err
+    wide = kept | {"seen": kept["seen"] | {"within_95_mm": 6.9}}
+    (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": wide}))
+    export(done, "ros2", tmp_path / "wide.xml", "--intrinsics", "given")
+    assert "with the given intrinsics a point is within 6.9 mm" in capsys.readouterr().err
     del content["with_given_intrinsics"]
     (done / "calibration.json").write_text(json.dumps(content | {"with_given_intrinsics": None}))
     with refused("--intrinsics given"):

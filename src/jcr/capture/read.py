@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,6 +32,8 @@ READERS: dict[str, Any] = {
 """Reader module of each format, in the order in which the formats are tested."""
 RECORDINGS = ("bag", "lerobot")
 """Formats whose images are stored inside a file and are extracted on reading."""
+OF_RECORDINGS = ("frames", "episode", "camera_topic", "joint_topic")
+"""Options of reading that concern recordings alone."""
 STATED = ("pose_convention", "pose_units", "poses", "pose_columns", "camera_info", "mount", "urdf")
 """Options of reading whose values a capture.json states itself."""
 
@@ -77,13 +79,8 @@ def read_source(
         )
     if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
         raise InputError(f"{path}: is one image; name the folder that holds all images and the gripper poses")
-    if options.frames < MIN_FRAMES:
-        raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed; take 5 to 15")
-    if options.pose_convention != "auto":
-        notation_of(options.pose_convention)  # a wrong name is an error, also for formats that do not need it
     name = format_of(path) if options.format == "auto" else options.format
-    if name == "capture":
-        _require_unset(path, options)
+    _require_fitting(path, name, options)
     if name not in RECORDINGS:
         folder, origin, found = None, [], READERS[name].read(path, options)
     elif into is None:
@@ -119,16 +116,27 @@ def _as_asked(found: Read, path: Path, options: ReadOptions) -> Read:
     return replace(found, frame_names=found.frame_names.replaced(**names))
 
 
-def _require_unset(path: Path, options: ReadOptions) -> None:
-    """Raise InputError if an option is set whose value a capture.json states itself."""
+def _require_fitting(path: Path, name: str, options: ReadOptions) -> None:
+    """Raise InputError for options of reading that are wrong, or do not concern a capture of the format `name`."""
+    if options.frames < MIN_FRAMES:
+        raise InputError(f"--frames {options.frames}: at least {MIN_FRAMES} are needed; take 5 to 15")
+    if options.pose_convention != "auto":
+        notation_of(options.pose_convention)  # a wrong name is an error, also for formats that do not need it
     default = ReadOptions()
-    given = [name for name in STATED if getattr(options, name) != getattr(default, name)]
-    if given:
-        flags = joined([f"--{name.replace('_', '-')}" for name in given])
+    given = [
+        field.name
+        for field in fields(options)
+        if getattr(options, field.name) != getattr(default, field.name)
+    ]
+    if name == "capture" and (stated := [one for one in given if one in STATED]):
+        flags = joined([f"--{one.replace('_', '-')}" for one in stated])
         raise InputError(
             f"{path}: its capture.json states poses, intrinsics and mount itself, and {flags} would change them; "
             "correct capture.json, or leave the option out (jcr docs captures)"
         )
+    if name not in RECORDINGS and (excess := [one for one in given if one in OF_RECORDINGS]):
+        flag = f"--{excess[0].replace('_', '-')}"
+        raise InputError(f"{path}: {flag} is for bags and data sets, which this is not; leave it out")
 
 
 def format_of(path: Path) -> str:

@@ -36,9 +36,9 @@ GROUPS = {
         "map_query_export_view.map": "build or rebuild the map of a run",
     },
     "check": {
-        "check_verify_compare.check": "check a capture before the calibration, in seconds (fixed camera: up to minutes)",
+        "check_verify_compare.check": "state what a calibration would state, and keep no files",
         "check_verify_compare.verify": "test with a few new images whether the camera has moved",
-        "check_verify_compare.compare": "test whether the uncertainties of two calibrations explain their difference",
+        "check_verify_compare.compare": "test whether two calibrations differ more than they state",
         "check_verify_compare.touch": "compare points that the robot's tip touches with the map",
     },
     "prepare": {
@@ -57,8 +57,9 @@ COMMANDS = {key.split(".")[1]: about for group in GROUPS.values() for key, about
 _OVERVIEW = """\
 usage: jcr COMMAND [ARGUMENTS]
 
-jcr calibrates a wrist camera without a target. From images and the gripper pose at each, it estimates the hand-eye
-transform, the metric scale and a map in the robot's base frame.
+jcr calibrates a wrist camera without a target. From images and the gripper
+pose at each, it estimates the hand-eye transform, the metric scale and a map
+in the robot's base frame.
 
 {commands}
 

@@ -12,7 +12,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, fields, is_dataclass, replace
-from itertools import takewhile
+from itertools import islice, takewhile
 from typing import Any, get_type_hints
 
 import tyro
@@ -33,7 +33,7 @@ HELP_WIDTH = 120
 """Largest width of the help's paragraphs in columns, also on a wider terminal."""
 LISTED_BY = {
     "run": ("reconstruction and calibration", ("calibrate", "reconstruct"), ("calibrate",)),
-    "check": ("reading images and poses that have no capture.json", ("read",), ()),
+    "check": ("reading images and poses without a capture.json", ("read",), ()),
     "map": ("points, map and objects", ("cloud", "map", "segment"), ()),
 }
 """Commands whose help lists the options of a subject for all commands that have them: the subject, the fields of these
@@ -77,6 +77,8 @@ def parsed(record: Any, program: str, arguments: Sequence[str]) -> Any:
                 why = message
         raise InputError(f"{why} ({program} --help)")
 
+    if "" in arguments:
+        raise InputError(f"an argument of {program} is empty; is the shell's variable unset?")
     # tyro also understands -h among the values of an option as a request for help.
     listed = _as_listed(record, program) if {"-h", "--help"} & {*arguments} else record
     with _errors.on_parse_error(refuse), _plain_descriptions(), _wrapped_paragraphs():
@@ -94,7 +96,8 @@ def _as_listed(record: Any, program: str) -> Any:
     for command_name, (subject, groups, also) in LISTED_BY.items():
         if name not in (command_name, *also) and (here := [group for group in groups if group in hints]):
             hidden |= {group: tyro.conf.Suppress[hints[group]] for group in here}
-            more.append(f"  jcr {command_name} --help  {subject}")
+            few = ", ".join(islice((flag for group in here for flag in _flags(hints[group])), 3))
+            more.append(f"  jcr {command_name} --help  {subject} ({few}, …)")
     if not more:
         return record
     about = "\n".join(

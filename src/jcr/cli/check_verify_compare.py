@@ -90,6 +90,7 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         LEAST_ACTIONS,
         MOST_LINES,
         actions,
+        corner_is_missed,
         details,
         left_out_lines,
         verdict_in_words,
@@ -111,6 +112,8 @@ def _check_lines(command: CheckCommand, found: "Examination") -> list[str]:
         outcome = f"{capture.camera_name} is good to calibrate, but {joined(bad)} would be rejected"
     elif found.verdict != "accepted" and required != "none":
         outcome = f"a calibration would not reach {required[0]:g} mm and {required[1]:g}°"
+    elif made is not None and corner_is_missed(made):
+        outcome += ", but the corners of the image would miss the required accuracy"
     elif made is None:
         outcome += " by the motion alone; whether the poses are those of the images was not checked"
     verdict = verdict_in_words(found.findings)
@@ -175,7 +178,7 @@ def _command_of_remedy(command: CheckCommand, found: "Examination") -> str:
 def _motion_lines(found: "Examination") -> list[str]:
     """Return the lines on the motion, the expected accuracy, and the agreement of poses and images."""
     from jcr.calibration.record import Calibration
-    from jcr.calibration.summary import accuracy_in_words
+    from jcr.calibration.summary import accuracy_in_words, corner_in_words
 
     rotation = np.degrees(found.largest_rotation_rad)
     motion = f"up to {1e3 * found.largest_move_m:.0f} mm and {rotation:.0f}° between two poses"
@@ -190,6 +193,7 @@ def _motion_lines(found: "Examination") -> list[str]:
         lines += labelled(
             "Expected",
             accuracy_in_words(found.expected),
+            *filter(None, [made and corner_in_words(made)]),
             f"from {count_of(len(found.counted), 'image')}, {errors}",
             f"1σ of the transform: {offset} mm, {turn}°, scale {significant(100 * std[6])} %",
         )

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -14,11 +15,10 @@ from numpy import ndarray
 
 from jcr.capture.options import ReadOptions
 from jcr.cli.output import Output, numbers, warn
-from jcr.errors import InputError, RejectedError
+from jcr.errors import InputError, RejectedError, count_of
 from jcr.export.options import ExportName, ExportOptions
 from jcr.extras import extra
 from jcr.files import write_text
-from jcr.findings import sentence
 from jcr.number_format import decimals_of
 from jcr.progress import progress_bars
 from jcr.scene.options import CloudOptions, MapOptions
@@ -54,14 +54,25 @@ class MapCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Build cloud, map and report of a run, and print their paths; return the exit status."""
+        """Build cloud, map and report of a run, and print what the map covers; raise RejectedError as `query` does."""
         from jcr.pipeline.run import build_map
 
         options = self.cloud, self.map, self.segment
         with progress_bars() as progress:
-            build_map(self.out, *options, add=self.add, read=self.read, progress=progress)
+            result = build_map(self.out, *options, add=self.add, read=self.read, progress=progress)
         files = {"map": str(self.out / "map.safetensors"), "report": str(self.out / "report.html")}
-        self.output.result((f"{name}: {file}" for name, file in files.items()), files)
+        lines = [f"{name}: {file}" for name, file in files.items()]
+        if (scene := result.scene) is not None:
+            lower, upper = (numbers(corner, 2) for corner in scene.box)
+            unseen = 100 * float((scene.seen.state == 0).double().mean())
+            lines[0] += (
+                f": from {lower} to {upper} m, {unseen:.0f} % of it unseen, cells of {1e3 * scene.cell:.1f} mm"
+            )
+        if len(result.added):
+            lines.append(f"added: {count_of(len(result.added), 'image')} in this and earlier commands")
+        self.output.result(lines, files)
+        if (doubt := result.doubt) is not None:
+            raise RejectedError(f"map rejected: {doubt}")
         return 0
 
 
@@ -114,8 +125,8 @@ class ExportCommand:
                 sys.stderr.write(f"{words}\n")
         if run.doubt is not None:
             warn(f"the calibration is rejected, and the file states the reason: {run.doubt}")
-        elif (short := run.calibration.short) is not None:
-            warn(sentence(short))
+        elif (short := run.short_in_words) is not None:
+            warn(short)
         return 0
 
 
@@ -144,7 +155,11 @@ class QueryCommand:
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
-        """Query the map at every point, and write or print the answers in the order of the input."""
+        """Query the map at every point, and write or print the answers in the order of the input.
+
+        Raises RejectedError (status 3) after that if the calibration is rejected.
+        """
+        from jcr.result import load_run
         from jcr.scene.map_file import load_map
 
         scene = load_map(self.out)
@@ -182,6 +197,8 @@ class QueryCommand:
         few = islice(zip(x_in_base, *values, labels, strict=True), PRINTED_POINTS)
         lines = [summary, *(_answer(*one) for one in few)]
         self.output.result(lines, answers)
+        if (doubt := load_run(self.out).doubt) is not None:
+            raise RejectedError(f"answers rejected: {doubt}")
         return 0
 
 
@@ -203,7 +220,8 @@ def _answer(
 def read_points(path: Path) -> Float[ndarray, "n 3"]:
     """Read points x, y, z (n,3) in metres, base frame, from .csv (three columns) or .npy (n,3).
 
-    Raises InputError for another file, and for a point that is not finite.
+    The names of a header line decide the order of the columns. Raises InputError for another file, for other names, and
+    for a point that is not finite.
     """
     from jcr.capture.documents import read_tables
     from jcr.capture.readings import numbers_of_table
@@ -215,12 +233,26 @@ def read_points(path: Path) -> Float[ndarray, "n 3"]:
     tables = [table for table in read_tables(path) if len(table.columns) == 3 and not table.place]
     if not tables:
         raise InputError(f"{path}: expected three numbers x, y, z (m) in each row")
-    points = numbers_of_table(tables[0])
+    points = numbers_of_table(tables[0])[:, _axes(path, tables[0].columns)]
     if not (finite := np.isfinite(points).all(1)).all():
         raise InputError(
             f"{path}: point {finite.argmin() + 1} is not three finite numbers; correct or remove it"
         )
     return points
+
+
+def _axes(path: Path, names: Sequence[str | None]) -> list[int]:
+    """Return the columns of x, y and z by the names of three columns; raise InputError for other names or units."""
+    from jcr.capture.readings import UNITS, words_of
+
+    if not any(names):
+        return [0, 1, 2]
+    words = [words_of(name or "") for name in names]
+    stated = [next((word for word in own if word in ("x", "y", "z")), "") for own in words]
+    units = {UNITS[word] for own in words for word in own if word in UNITS}
+    if sorted(stated) != ["x", "y", "z"] or not units <= {"m"}:
+        raise InputError(f"{path}: columns {', '.join(map(str, names))}; name them x, y, z and give metres")
+    return [stated.index(axis) for axis in ("x", "y", "z")]
 
 
 @dataclass(frozen=True)

@@ -53,21 +53,24 @@ class CalibrateCommand:
     calibrate: CalibrateOptions = field(default_factory=CalibrateOptions)
     reconstruct: ReconstructOptions = field(default_factory=ReconstructOptions)
     read: ReadOptions = field(default_factory=ReadOptions)
-    depth: DepthOptions = field(default_factory=DepthOptions)
 
     def main(self) -> int:
         """Calibrate and print the result; return the exit status of `show`."""
         from jcr.capture.read import read_source
-        from jcr.pipeline.run import calibrate_poses
+        from jcr.pipeline.run import calibrate_poses, require_folder_of_results
         from jcr.result import CAPTURE
 
+        require_folder_of_results(self.out)
         with progress_bars() as progress:
             with locked(self.out):
                 capture = read_source(self.capture, self.read, into=self.out / CAPTURE, progress=progress)
-            if not isinstance(capture, PosePairs):
-                return show(_run(self, capture, run_options(self, map=None), progress), self.output)
-            result = calibrate_poses(capture, self.out, self.calibrate, self.method)
-        show_calibration(result, capture, self.output)
+            if isinstance(capture, PosePairs):
+                result = calibrate_poses(capture, self.out, self.calibrate, self.method)
+            else:
+                result = _run(self, capture, run_options(self, map=None), progress)
+        # While progress bars are drawn, rich would also wrap commands that are to be copied.
+        if isinstance(capture, PosePairs):
+            show_calibration(result, capture, self.output)
         return show(result, self.output)
 
 
@@ -88,6 +91,7 @@ class RunCommand(CalibrateCommand):
       jcr run scan.mcap out/scan --base-frame base_link --gripper-frame tool0 --frames 12
     """
 
+    depth: DepthOptions = field(default_factory=DepthOptions)
     cloud: CloudOptions = field(default_factory=CloudOptions)
     map: MapOptions = field(default_factory=MapOptions)
     segment: SegmentOptions = field(default_factory=SegmentOptions)
@@ -97,8 +101,10 @@ class RunCommand(CalibrateCommand):
     def main(self) -> int:
         """Run every stage, print the result and return the exit status of `show`."""
         from jcr.capture.read import read_capture
+        from jcr.pipeline.run import require_folder_of_results
         from jcr.result import CAPTURE
 
+        require_folder_of_results(self.out)
         options = run_options(self, map=None if self.no_map else self.map)
         with progress_bars() as progress:
             with locked(self.out):

@@ -19,7 +19,7 @@ from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
 from jcr.extras import extra
 from jcr.files import written_whole
-from jcr.findings.finding import joined
+from jcr.findings.finding import joined, sentence
 from jcr.geometry import scale_translation, transform
 from jcr.number_format import significant
 from jcr.options import checked_options
@@ -192,6 +192,22 @@ class ExportedRun:
         """Reason why the calibration or the chosen camera is rejected; None if accepted."""
         if self.doubt is None and self.camera is not None:
             self.doubt = self.camera.doubt
+
+    @property
+    def short_in_words(self) -> str | None:
+        """Reason in words why the exported transform misses the required accuracy; None if it reaches it."""
+        found = self.calibration
+        kept, required = found.with_given_intrinsics, found.requirement
+        if self.options.intrinsics == "estimated" or self.camera is not None or kept is None:
+            return None if found.short is None else sentence(found.short)
+        mm, deg = kept.seen.within_95_mm, kept.seen.rotation_95_deg
+        if required is None or (mm <= required.translation_mm and deg <= required.rotation_deg):
+            return None
+        return (
+            f"with the given intrinsics a point is within {significant(mm)} mm and {significant(deg)}° (95 %), and "
+            f"{required.translation_mm:g} mm and {required.rotation_deg:g}° are required; "
+            "export the estimated ones, and set them in the driver"
+        )
 
     @property
     def notes(self) -> dict[str, str]:

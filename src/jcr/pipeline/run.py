@@ -44,8 +44,8 @@ from jcr.records import Capture, PosePairs, Reconstruction
 from jcr.result import CAPTURE, CLOUD, REPORT, RunOptions, RunResult
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import MAP_PACKAGES, require_packages
-from jcr.scene.options import CloudOptions, MapOptions, check_workspace
-from jcr.segments.options import SegmentOptions
+from jcr.scene.options import CloudOptions, MapOptions, check_cloud_options, check_map_options
+from jcr.segments.options import SegmentOptions, check_segment_options
 
 if TYPE_CHECKING:
     from jcr.segments.measure import Measurement
@@ -72,8 +72,7 @@ def run(
     _require_valid(options)
     if not isinstance(capture, Capture | str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
-    if (out / "capture.json").is_file():
-        raise InputError(f"{out}: is a capture, and the results need a folder of their own; name another one")
+    require_folder_of_results(out)
     if not isinstance(capture, Capture):
         with locked(out):
             capture = read_capture(capture, into=out / CAPTURE)
@@ -169,6 +168,7 @@ def build_map(
         map=checked_options(map, MapOptions),
         segment=checked_options(segment, SegmentOptions),
     )
+    _require_valid(options)
     require_packages("the map", "; `jcr run` and `jcr calibrate` calibrate without it")
     with locked(before.out):
         result = begun(before.out, before.capture, options)
@@ -233,14 +233,26 @@ def measure(out: str | Path) -> "Measurement":
 def _require_valid(options: RunOptions) -> None:
     """Raise InputError for options that a late stage would refuse, before time is spent on the images."""
     check_options(options.calibrate)
+    if options.calibrate.scale is not None:
+        raise InputError(
+            "scale: is for camera poses without images (samples); images have no unit, leave it out"
+        )
     if options.reconstruct.board is not None:
         from jcr.boards.detection import boards
 
         boards(options.reconstruct.board)  # raises InputError if the option does not describe a board
     if options.map is not None:
-        check_workspace(options.map.workspace)
+        check_cloud_options(options.cloud)
+        check_map_options(options.map)
+        check_segment_options(options.segment)
     if options.reconstruct.device == "cuda":
         device_of(options.reconstruct)
+
+
+def require_folder_of_results(out: Path) -> None:
+    """Raise InputError if `out` is a capture."""
+    if (out / "capture.json").is_file():
+        raise InputError(f"{out}: is a capture, and the results need a folder of their own; name another one")
 
 
 def _require_own_run(capture: Capture, out: Path) -> None:

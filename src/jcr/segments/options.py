@@ -1,11 +1,14 @@
 """Options and result type of the segmentation, kept apart so that the help of the command line imports no SciPy."""
 
 from dataclasses import dataclass, field
+from math import inf
 from typing import Annotated, Literal
 
 import tyro
 from jaxtyping import Int
 from numpy import ndarray
+
+from jcr.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,18 @@ class SegmentOptions:
     sam_weights: Annotated[str, tyro.conf.arg(metavar="PATH_OR_HUB_ID")] = "facebook/sam2.1-hiera-tiny"
     """Path or hub id of Segment Anything's weights."""
     tabletop: TabletopOptions = field(default_factory=TabletopOptions)
+
+
+def check_segment_options(options: SegmentOptions) -> None:
+    """Raise InputError if a limit of an object is no length, or the lowest height is not below the highest."""
+    limits = options.tabletop
+    for name, value in vars(limits).items():
+        if not 0 < value < inf:
+            raise InputError(f"{name} {value:g}: give metres above 0")
+    if not limits.object_lowest < limits.object_highest:
+        raise InputError(
+            f"object_lowest {limits.object_lowest:g}: give less than object_highest, {limits.object_highest:g} m"
+        )
 
 
 LabelImages = tuple[Int[ndarray, "m h w"], tuple[str, ...]]
