@@ -165,14 +165,14 @@ def left_out_lines(content: AnyCalibration) -> list[str]:
 def pair_in_words(content: Calibration) -> list[str]:
     """Return up to two lines: the intrinsics that belong to the transform, and the error of a point with the given ones.
 
-    The list is empty without intrinsics.
+    The list is empty without intrinsics, and has no second line for a rejected calibration.
     """
     if (camera := content.intrinsics) is None:
         return []
     given = content.with_given_intrinsics
     how = "used" if camera.std is None else "estimated" if given is None else "given, refined"
     use = [f"{how}: {intrinsics_in_words(camera)}; use them together with the transform"]
-    if given is not None and (mm := mixed_pair_mm(content)) is not None:
+    if given is not None and content.converged and (mm := mixed_pair_mm(content)) is not None:
         pair = f"with the given ones (fx {given.intrinsics.fx:.1f}) and this transform"
         use.append(f"{pair} a point is up to {significant(mm)} mm off (jcr docs exports)")
     return use
