@@ -11,6 +11,8 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from numpy import ndarray
 
+from jcr.number_format import significant
+
 REPORT = "jcr.report"
 """Package whose templates all pages share."""
 TRACK_COLOR = (229, 40, 40)
@@ -36,6 +38,7 @@ def _environment(package: str) -> Environment:
         return Markup(loader.get_source(environment, name)[0])  # nosec B704: a file of this package, no text from outside
 
     environment.globals["source"] = source
+    environment.filters["significant"] = significant
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
     return environment
 
