@@ -185,7 +185,7 @@ def dispatch(arguments: Sequence[str]) -> int:
             cause = cause.__cause__ or cause.__context__
         if cause is None:
             raise
-        status, message = 130, "interrupted; finished stages are kept and the same command resumes"
+        status, message = 130, "interrupted; the same command resumes after the last finished stage"
     line = printable(" ".join(message.split()))
     # Messages quote the content of files, in which a name may have a million letters.
     sys.stderr.write(f"error: {line if len(line) <= LONGEST_LINE else f'{line[:LONGEST_LINE]}…'}\n")

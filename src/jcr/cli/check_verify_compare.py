@@ -200,7 +200,7 @@ def _motion_lines(found: "Examination") -> list[str]:
     if isinstance(made, Calibration):
         noise = made.robot_noise
         agreement = f"{1e3 * noise.translation:.2f} mm, {np.degrees(noise.rotation):.3f}° per axis"
-        lines += labelled("Agreement", f"poses and images: {agreement}")
+        lines += labelled("Agreement", f"poses and images: {agreement}, random errors alone")
     return lines
 
 
