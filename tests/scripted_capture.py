@@ -109,13 +109,15 @@ def a_capture(
     tell: Callable[[Answer, list[str]], None] = lambda answer, lines: None,
     gripper: Callable[[], RobotState] | None = None,
     accurate_from: int = 100,
+    verifies: Path | None = None,
     **options: Any,
 ) -> tuple[LiveSession, Scripted]:
     """Return a session that captures these frames into a folder, and its calibration."""
     scripted: Any = Scripted(LiveFolder(folder), accurate_from=accurate_from)
     camera = Camera(frames, lambda: None)
     options = {"require": REQUIRED} | options
-    return LiveSession(scripted, camera, SessionOptions(**options), tell, gripper=gripper), scripted
+    session = LiveSession(scripted, camera, SessionOptions(**options), tell, gripper, verifies)
+    return session, scripted
 
 
 def still_frames(image: Callable[[], ndarray]) -> Iterator[Frame]:

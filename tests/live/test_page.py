@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from jcr.live.progress import progress_lines
 from jcr.live.robot import RobotState
 from jcr.live.server import MAX_SAMPLE, LiveServer
 from jcr.live.session import LiveSession
+from jcr.pipeline.options import TOLERANCE
+from jcr.pipeline.verify import Move, of_two_poses
 from places import ROOT
 from refusal import refused
 from scripted_capture import Scripted, a_capture, poses, still_frames, video
@@ -257,16 +260,16 @@ def serving(tmp_path: Path, tabletop: Path) -> Callable[..., Any]:
     """A server whose samples are all kept, and the samples that it took."""
 
     @contextmanager
-    def served(**listen: Any) -> Iterator[tuple[LiveServer, list[RobotState]]]:
+    def served(verifies: Path | None = None) -> Iterator[tuple[LiveServer, list[RobotState]]]:
         image, taken = read_image(tabletop / "images" / "00.jpg"), []
-        session, _ = a_capture(tmp_path / "c", still_frames(lambda: image))
+        session, _ = a_capture(tmp_path / "c", still_frames(lambda: image), verifies=verifies)
 
         def take(state: RobotState, waits: bool) -> dict[str, Any]:
             taken.append(state)
             return {"accepted": True, "done": False}
 
         session.take = take  # pyright: ignore[reportAttributeAccessIssue]
-        with LiveServer(session, **listen, takes_samples=True) as server:
+        with LiveServer(session, takes_samples=True) as server:
             yield server, taken
 
     return served
@@ -297,6 +300,9 @@ def test_a_web_page_on_the_same_machine_cannot_add_a_pose(serving: Callable[...,
             assert posted(server, sample, path, Authorization=None, **evil)[0] in (403, 404), path
         # DNS rebinding: the name of the other site leads to this server.
         rebound: dict[str, str | None] = {"Host": f"evil.example:{server.server_port}", "Origin": None}
+        assert "host evil.example" in posted(server, sample, **rebound)[1]["reason"]
+        with asked(server, "PUT", "/sample", sample) as answer:
+            assert answer.status == 405 and "PUT" in json.loads(answer.read())["reason"]
         alone: list[dict[str, str | None]] = [{"Authorization": None}, {"Authorization": "Bearer wrong"}]
         for headers in (*alone, {"Origin": "http://evil.example"}, {"Origin": "null"}, rebound):
             assert posted(server, sample, **headers)[0] == 403, headers
@@ -374,24 +380,78 @@ def test_an_unexpected_error_of_the_calibration_answers_500(tmp_path: Path, tabl
         session.run()
 
 
-def test_a_run_is_verified_when_a_program_asks(serving: Callable[..., Any]):
-    outcomes: list[Any] = [
-        {"moved": True, "drift_mm": np.arange(3.0)},
-        jcr.RejectedError("cannot tell: no images"),
-    ]
+def test_a_run_is_verified_when_a_program_asks(serving: Callable[..., Any], monkeypatch: pytest.MonkeyPatch):
+    step = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+    moves = (Move(("camera",), 0, "today", step),)
+    moved = replace(of_two_poses(step, 1e-8 * np.eye(6), TOLERANCE, ["images/001.png"], ()), moves=moves)
+    outcomes: list[Any] = [moved, jcr.RejectedError("cannot tell: no images"), moved]
 
-    def verify() -> dict[str, Any]:
+    def verify(run: Path, capture: Path) -> Any:
         if isinstance(outcome := outcomes.pop(0), Exception):
             raise outcome
         return outcome
 
+    monkeypatch.setattr("jcr.pipeline.verify.verify_run", verify)
     with serving() as (server, _):
         assert posted(server, "", "/verify")[0] == 409
-    with serving(verify=verify) as (server, taken):
+    with serving(verifies=Path("out/table")) as (server, taken):
         assert posted(server, "", "/verify", Authorization="Bearer wrong")[0] == 403
-        assert posted(server, "", "/verify") == (200, {"moved": True, "drift_mm": [0.0, 1.0, 2.0]})
+        status, answer = posted(server, "", "/verify")
+        assert status == 200 and answer["moved"] and answer["drift_mm"] == pytest.approx([10, 0, 0])
+        shown = parts(server)["parts"]["head"]
+        assert "verdict bad" in shown and "moved by 10.00 mm" in shown
         assert posted(server, "{}", "/verify") == (422, {"reason": "cannot tell: no images"})
-        assert not taken
+        assert "cannot tell: no images" in parts(server)["parts"]["head"] and not taken
+
+
+def test_a_capture_that_verifies_states_what_is_missing_and_the_verdict(
+    tmp_path, tabletop: Path, monkeypatch
+):
+    """Page and terminal speak of the images to verify, and not of the requirement of a calibration."""
+    still = of_two_poses(np.zeros(6), 1e-8 * np.eye(6), TOLERANCE, ["images/001.png"], ())
+    monkeypatch.setattr("jcr.pipeline.verify.verify_run", lambda run, capture: still)
+    said, image = list[str](), read_image(tabletop / "images" / "00.jpg")
+    session, scripted = a_capture(
+        tmp_path / "c", still_frames(lambda: image), lambda answer, lines: said.extend(lines),
+        verifies=Path("out/table"), images=2,
+    )  # fmt: skip
+    with LiveServer(session, takes_samples=True) as server:
+        assert posted(server, {"base_from_gripper": poses(tabletop)[0].tolist()})[0] == 200
+        until(lambda: "1 of 2 images to verify" in parts(server)["parts"]["head"])
+        assert any("1 more image" in line for line in said) and not any("accuracy" in line for line in said)
+        assert session.finish() is None and not scripted.finished
+        shown = parts(server)["parts"]
+        assert "verdict good" in shown["head"] and "Verification: accepted" in shown["head"]
+        assert "<span>used</span>" in shown["images"]
+
+
+def test_numbers_of_images_are_of_one_state_until_they_are_calibrated(
+    capture: tuple[LiveSession, Scripted], tabletop: Path
+):
+    live, scripted = capture
+    add(live, scripted, tabletop, 4)
+    live.folder.remove("images/002.png")
+    live._show("removed images/002.png")
+    with LiveServer(live) as page:
+        assert "3 of 3" in parts(page)["parts"]["head"]
+        live._report(scripted.update())
+        live.folder.undo()
+        live._show("undone: 4 images")
+        assert "3 of 3" in parts(page)["parts"]["head"] and "1 new" in parts(page)["parts"]["head"]
+
+
+def test_the_page_states_the_final_calibration_as_soon_as_the_capture_ends(
+    capture: tuple[LiveSession, Scripted], tabletop: Path
+):
+    live, scripted = capture
+    add(live, scripted, tabletop, 5)
+    running = threading.Thread(target=live.run)
+    running.start()
+    until(lambda: not live.state.event)
+    live.press("finish")
+    running.join(60)
+    with LiveServer(live) as page:
+        assert "final calibration of all 5 images" in parts(page)["parts"]["head"]
 
 
 def test_samples_of_a_watched_arm_are_refused(tmp_path: Path, tabletop: Path):

@@ -74,7 +74,6 @@ class CaptureCommand:
         from jcr.cli.check_verify_compare import verification_lines
         from jcr.live.calibration import LiveCalibration
         from jcr.live.server import LiveServer
-        from jcr.pipeline.verify import verify_run
 
         options, out, states = self.session, self.out, states_of(self.poses)
         if options.until_accurate and options.require == "none":
@@ -97,11 +96,10 @@ class CaptureCommand:
             given, limits = given or camera.intrinsics, {"require": options.require}
             calibration = LiveCalibration(out, intrinsics=given, robot=self.robot, options=limits)
             gripper = None if states is None else lambda: next(states())
-            session = LiveSession(calibration, camera, options, tell, gripper)
+            session = LiveSession(calibration, camera, options, tell, gripper, run)
             token = os.environ.get("JCR_TOKEN") or None
             try:
-                check = None if run is None else lambda: verify_run(run, out).as_json()
-                with LiveServer(session, self.page_port, token, self.poses == "http", check) as server:
+                with LiveServer(session, self.page_port, token, self.poses == "http") as server:
                     _print(
                         f"{count_of(len(calibration.live.names), 'image')} in {out}; open {server.address} in a browser"
                     )
@@ -112,15 +110,14 @@ class CaptureCommand:
                         where = self.poses.partition(":")[2]
                         _print(f"move the arm; an image is taken whenever it rests ({where})")
                         session.run(lambda: session.watch(states))
-                    result = session.finish(calibrates=run is None)
+                    result = session.finish()
             finally:
                 calibration.close()
         if not calibration.live.names:
             why = session.state.event.removeprefix("refused: ") or "none was asked for"
             raise InputError(f"{out}: no image was kept: {why}; the same command begins again")
         facts = {"capture": str(out), "images": calibration.live.names, "answers": answers}
-        if run is not None:
-            found = verify_run(run, out)
+        if (found := session.state.verification) is not None:
             self.output.result(verification_lines(found, False), facts | {"verification": found.as_json()})
             return 3 if found.moved else 0
         return _conclude(self, facts, result, calibration.progress.requirement_met)

@@ -3,7 +3,7 @@
 import json
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -14,13 +14,23 @@ from jcr.calibration.options import RequiredAccuracy
 from jcr.capture.images import encode_jpeg, read_image
 from jcr.errors import count_of
 from jcr.findings import reached_in_words, sentence
-from jcr.live.progress import accuracy_line, advice, faults, finding_lines, reached_accuracy
+from jcr.live.progress import (
+    accuracy_line,
+    advice,
+    faults,
+    finding_lines,
+    reached_accuracy,
+    verifying_lines,
+)
 from jcr.live.session import LiveSession, SessionState
 from jcr.number_format import significant
 from jcr.records import Intrinsics
 from jcr.report.render import render
 from jcr.report.scene3d import scene_data, scene_view, track_layer
 from jcr.report.verdict import Tile
+
+if TYPE_CHECKING:
+    from jcr.pipeline.verify import Verification
 
 PACKAGE = "jcr.live"
 TEMPLATES = ("head", "images")
@@ -73,7 +83,7 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
     """Return a card for each image: its number in commands, file name, the finding about it, and registration state.
 
     Keys: "number" (from 1), "name", "fault" (empty without one), "kind" (CSS class: used, warned or rejected) and
-    "state" ("registered", "not registered" or "new"; after the final calibration "used" or "left out").
+    "state" ("registered", "not registered" or "new"; after calibration or verification "used" or "left out").
     """
     progress, against, kinds = state.progress, dict[str, str](), dict[str, str]()
     findings = progress.findings if state.result is None else state.result.calibration.findings
@@ -84,8 +94,12 @@ def _cards(state: SessionState) -> list[dict[str, Any]]:
     registered = dict.fromkeys(progress.images, "not registered")
     registered |= dict.fromkeys(progress.registered, "registered")
     registered |= dict.fromkeys(filter(None, [state.replaces]), "the next image replaces this one")
+    used = None if state.verification is None else set(state.verification.images)
+    if state.verifies is not None:
+        registered = dict.fromkeys(state.names, "taken")
     if state.result is not None:
         used = {one.image for one in state.result.calibration.images if one.used}
+    if used is not None:
         registered = {name: "used" if name in used else "left out" for name in state.names}
     return [
         {"number": number, "name": name, "fault": against.get(name, ""), "kind": kinds.get(name, "used")}
@@ -108,10 +122,14 @@ def verdict_lines(state: SessionState) -> list[str]:
     if state.is_refusal:
         return ["bad", state.event, *(sentence(one) for one in wrong)]
     if state.event:
-        return ["", state.event]
+        return ["", state.event, *([] if state.is_over else _verifying(state))]
+    if state.verification is not None:
+        return _verification_lines(state.verification)
     if not count:
         first = "Move the arm so that the camera sees textured things at different heights, and let it rest."
-        return ["", "No image yet", first]
+        return ["", "No image yet", first, *_verifying(state)]
+    if state.verifies is not None:
+        return ["", *_verifying(state)]
     if not progress.images:
         return ["", f"{count} images", "They are being calibrated."]
     lines = finding_lines(progress)
@@ -124,6 +142,32 @@ def verdict_lines(state: SessionState) -> list[str]:
     return ["", f"{count} images", accuracy_line(progress), advice(progress)]
 
 
+def _verifying(state: SessionState) -> list[str]:
+    """Return what is still needed to verify a run; empty if none is verified."""
+    return [] if state.verifies is None else verifying_lines(state.verifies, len(state.images), state.most)
+
+
+def _verification_lines(found: "Verification") -> list[str]:
+    """Return the lines of `verdict_lines` for a verification: verdict, what has moved, remedy, notes and sensitivity."""
+    kind = "bad" if found.moved else "fair" if found.notes else "good"
+    remedy = [f"Remedy: {found.advice}"] if found.moved else []
+    mm, deg = significant(1e3 * found.detectable[0]), significant(float(np.degrees(found.detectable[1])))
+    sensitivity = (
+        f"{count_of(len(found.images), 'image')} used; they find 9 of 10 changes of {mm} mm or {deg}°"
+    )
+    return [kind, f"verification: {found.verdict}", found.finding, *remedy, *found.notes, sensitivity]
+
+
+def _verifying_tiles(state: SessionState) -> list[Tile]:
+    """Return tiles of a capture that verifies a run: number of images and, after the verification, the drift."""
+    tiles: list[Tile] = [("Images", f"{len(state.images)} of {state.most}", "", "first")]
+    if (found := state.verification) is not None:
+        mm, deg = 1e3 * np.linalg.norm(found.offset[:3]), np.degrees(np.linalg.norm(found.offset[3:]))
+        size = f"{significant(float(mm))} mm, {significant(float(deg))}°"
+        tiles.append(("Drift of the camera", size, "from the calibration", "first"))
+    return tiles
+
+
 def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
     """Return tiles of reached and required accuracy, number of registered images, and leave-one-out error.
 
@@ -132,6 +176,8 @@ def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
     """
     if not state.images:
         return []
+    if state.verifies is not None:
+        return _verifying_tiles(state)
     tiles, reached, error = list[Tile](), state.progress.reached or (), state.progress.leave_one_out
     if state.result is not None:
         error = state.result.calibration.held_out
@@ -142,10 +188,13 @@ def _tiles(state: SessionState, required: RequiredAccuracy) -> list[Tile]:
     for k, ((name, unit), value) in enumerate(zip(names, reached, strict=False)):
         limits = [] if required == "none" else [f"required {required[k]:g}{unit}"]
         tiles.append((f"{name}, 95 %", f"± {significant(value)}{unit}", "; ".join(limits + without), "first"))
-    name, count = "Images registered", len(state.progress.registered)
+    # The images of the last calibration; some may be removed since, and others are not calibrated yet.
+    calibrated = [name for name in state.names if name in state.progress.images]
+    new = len(state.images) - len(calibrated)
+    name, count = "Images registered", sum(name in state.progress.registered for name in calibrated)
     if state.result is not None:
-        name, count = "Images used", state.result.calibration.images_used
-    tiles.append((name, f"{count} of {len(state.images)}", "", ""))
+        name, count, calibrated, new = "Images used", state.result.calibration.images_used, state.names, 0
+    tiles.append((name, f"{count} of {len(calibrated)}", f"{new} new" if new else "", ""))
     if error is not None:
         size = f"{significant(error.translation_mm)} mm, {significant(error.rotation_deg)}°"
         px = "" if error.reprojection_px is None else f"{significant(error.reprojection_px)} px"

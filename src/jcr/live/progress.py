@@ -1,6 +1,7 @@
 """State of a live calibration after each image: as a record, as lines of the terminal, and as JSON for a program."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from jaxtyping import Float
@@ -8,6 +9,7 @@ from numpy import ndarray
 
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.summary import leave_one_out_text
+from jcr.errors import count_of
 from jcr.findings import Finding, FindingKind, sentence, without_consequences
 from jcr.number_format import significant
 from jcr.records import LeaveOneOut
@@ -134,6 +136,13 @@ def progress_lines(state: LiveProgress) -> list[str]:
     if (error := state.leave_one_out) is not None:
         below.insert(0, f"leave-one-out error {leave_one_out_text(error)}")
     return [accuracy_line(state), *(f"  {line}" for line in below), advice(state)]
+
+
+def verifying_lines(run: Path, taken: int, most: int) -> list[str]:
+    """Return the state of a capture that verifies a run folder: images `taken` of `most`, and what is missing."""
+    missing = most - taken
+    more = f"{count_of(missing, 'more image')}: {FIRST_ADVICE}; Finish verifies with those taken so far"
+    return [f"{taken} of {count_of(most, 'image')} to verify {run}", *([more] if missing > 0 else [])]
 
 
 def accuracy_line(state: LiveProgress) -> str:

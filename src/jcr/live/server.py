@@ -12,8 +12,8 @@ import secrets
 import sys
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
+from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, get_args
@@ -71,18 +71,16 @@ class LiveServer(ThreadingHTTPServer):
         port: int = 0,
         token: str | None = None,
         takes_samples: bool = False,
-        verify: Callable[[], dict[str, Any]] | None = None,
     ) -> None:
         """Bind a port of the loopback address; raise InputError if that fails.
 
         `token` is the key that the addresses of all requests contain; None: a random key. `port` 0: any free port.
-        `takes_samples`: other programs may post gripper poses, at which images are then taken. `verify` verifies a run
-        with the images taken so far, and returns the answer to `POST /verify`; None: no run is verified.
+        `takes_samples`: other programs may post gripper poses, at which images are then taken.
         """
         if token is not None and not re.fullmatch(r"[\w.~-]+", token, re.ASCII):
             raise InputError("JCR_TOKEN: has characters that no address has; use letters, digits, - and _")
         self.session, self.key = session, token or secrets.token_urlsafe(16)
-        self.takes_samples, self.verify = takes_samples, verify
+        self.takes_samples = takes_samples
         self.page_version, self.page_s = -1, -np.inf
         """Version of the state that the page shows, and time (s, monotonic clock) of the page's last request."""
         try:
@@ -187,6 +185,14 @@ class _Handler(BaseHTTPRequestHandler):
             else:
                 self._send(status=400 if is_own else 403)
 
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Answer another method than GET and POST with the reason as JSON, and other errors as the base class does."""
+        if code != HTTPStatus.NOT_IMPLEMENTED:
+            super().send_error(code, message, explain)
+            return
+        reason = f"the method {self.command} is not allowed; use GET or POST"
+        self._send_json({"accepted": False, "reason": reason}, HTTPStatus.METHOD_NOT_ALLOWED)
+
     def _command(self) -> _Command | None:
         """Return the command in the request's body; None if it is none."""
         with suppress(ValidationError):
@@ -218,7 +224,9 @@ class _Handler(BaseHTTPRequestHandler):
     def _refused(self) -> str | None:
         """Return the reason why a request of a program is refused; None if its key, host and origin are right."""
         key = self.headers.get("Authorization", "").removeprefix("Bearer ").strip()
-        if self.headers.get("Host") not in self.server.hosts or not self._is_key(key):
+        if (foreign := self._foreign_host()) is not None:
+            return foreign
+        if not self._is_key(key):
             return "no or a wrong key; send the header Authorization: Bearer KEY"
         if "Origin" in self.headers and not self._is_own_origin():
             return "a request from another web site"
@@ -228,12 +236,11 @@ class _Handler(BaseHTTPRequestHandler):
         """Verify the run with the images taken so far; return the answer and the HTTP status."""
         if self._body(MAX_COMMAND) is None:
             return {"reason": f"no Content-Length, or more than {MAX_COMMAND} bytes"}, 400
-        if self.server.verify is None:
-            return {"reason": "no run is verified; start the capture with --verify OUT"}, 409
+        session = self.server.session
         try:
-            return self.server.verify(), 200
+            return session.verify().as_json(), 200
         except (InputError, RejectedError) as error:
-            return {"reason": str(error)}, 422
+            return {"reason": str(error)}, 409 if session.state.verifies is None else 422
 
     def _sampled(self) -> tuple[dict[str, Any], int]:
         """Take an image at the gripper pose in the request's body; return the answer and the HTTP status."""
@@ -256,6 +263,12 @@ class _Handler(BaseHTTPRequestHandler):
                 return answer, 200 if answer["accepted"] else 422
         return {"accepted": False, "reason": why}, status
 
+    def _foreign_host(self) -> str | None:
+        """Return the reason why the header `Host` is refused; None if it names this server."""
+        if (host := self.headers.get("Host")) in self.server.hosts:
+            return None
+        return f"the host {host} is not allowed in the header Host; address {' or '.join(self.server.hosts)}"
+
     def _is_own_origin(self) -> bool:
         """Test whether the header `Origin` is that of this server's page."""
         return self.headers.get("Origin") in [f"http://{host}" for host in self.server.hosts]
@@ -263,8 +276,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _path(self) -> str | None:
         """Return the request's path after the key; None if host or key are wrong, after an error was sent."""
         key, slash, path = self.path.removeprefix("/").partition("/")
-        if self.headers.get("Host") not in self.server.hosts:
-            self._send(status=403)
+        if (foreign := self._foreign_host()) is not None:
+            self._send_json({"reason": foreign}, 403)
         elif not slash or not self._is_key(key):
             self._send_json(
                 {"reason": "not found; programs use GET /state and POST /sample, /press, /verify"}, 404

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,14 +17,15 @@ from numpy import ndarray
 
 from jcr.calibration.options import GRASPING, RequiredAccuracy
 from jcr.capture.options import MIN_FRAMES
-from jcr.errors import InputError, RejectedError
+from jcr.errors import InputError, RejectedError, count_of
 from jcr.live.cameras import COMPARED_S, Camera, Frame, frame_at_rest
-from jcr.live.progress import LiveProgress, progress_lines
+from jcr.live.progress import LiveProgress, progress_lines, verifying_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 from jcr.records.capture_json import FrameEntry
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration
+    from jcr.pipeline.verify import Verification
     from jcr.result import RunResult
 
 SAME_VIEW_AS = (0.005, np.radians(1.0))
@@ -73,6 +75,12 @@ class SessionState:
     """Whether this is the last state of the session."""
     result: "RunResult | None" = None
     """Final calibration of all images; None before the end, or if it failed."""
+    most: int = ENOUGH_IMAGES
+    """Number of images at which the capture ends."""
+    verifies: Path | None = None
+    """Run folder that the images verify; None: the images are calibrated."""
+    verification: "Verification | None" = None
+    """Result of the verification with these images; None before the first, and after a change of the images."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,24 +98,26 @@ class LiveSession:
         options: SessionOptions | None = None,
         tell: Callable[[Answer, list[str]], None] = lambda answer, lines: None,
         gripper: Callable[[], RobotState] | None = None,
+        verifies: Path | None = None,
     ) -> None:
         """Prepare a session that adds images of `camera` to `calibration`; `run` starts it.
 
         `tell` is called with each answer and each state of the calibration, as JSON and as lines for a person.
         `gripper` returns the present state of the arm, for an image on command and to detect motion after each image;
-        None: poses are typed or posted.
+        None: poses are typed or posted. `verifies` is a run folder that is verified with the images, which are then not
+        calibrated; None: they are calibrated.
         """
         self.calibration, self.folder, self.camera = calibration, calibration.live, camera
         self.options = options or SessionOptions()
         self._tell, self._gripper = tell, gripper
-        self._most = self.options.images or (MOST_IMAGES if self.options.until_accurate else ENOUGH_IMAGES)
+        most = self.options.images or (MOST_IMAGES if self.options.until_accurate else ENOUGH_IMAGES)
         self._frames = iter(camera.frames)
         self._lock = threading.RLock()
         """Lock that is held while an image is taken or a command is executed."""
         self._changed = threading.Condition()
         self.has_gripper = gripper is not None
         """Whether the session can read the pose of the gripper, so that a person can take an image."""
-        self.state = SessionState(images=self.folder.images)
+        self.state = SessionState(images=self.folder.images, most=most, verifies=verifies)
         self._calibrated: tuple[str, ...] | None = None
         self._error: Exception | None = None
         self._worker = ThreadPoolExecutor(1)
@@ -130,13 +140,15 @@ class LiveSession:
             self.end()
 
         self._follow()
-        self._show(is_over=len(self.folder.names) >= self._most)
+        self._show(is_over=len(self.folder.names) >= self.state.most)
         if source is not None:
             threading.Thread(target=request, daemon=True).start()
         longest_s, abandon = INTERRUPTED_S, True
         try:
             with self._changed:
                 self._changed.wait_for(lambda: self.state.is_over)
+                if self._error is None and self.state.result is None:
+                    self._show(self._last_step or self.state.event)
             longest_s, abandon = LONGEST_S, self._error is not None
         finally:
             # Wait until all images are calibrated; after an interruption or error, for the running calibration only.
@@ -185,7 +197,7 @@ class LiveSession:
                 self._say(f"refused: {why}", answer)
             else:
                 self._follow()
-                is_over = len(self.folder.names) >= self._most
+                is_over = len(self.folder.names) >= self.state.most
                 answer = {"accepted": True, "image": name, "done": self.state.is_over or is_over}
                 event = f"kept {name}" if old is None else f"kept {name} in place of {old}"
                 self._say(event, answer, is_over=is_over, replaces=None)
@@ -211,7 +223,7 @@ class LiveSession:
             elif action == "undo":
                 self._undo()
             elif action in ("retake", "remove") and not 1 <= number <= len(names):
-                self._refuse(f"refused: there is no image {number}")
+                self._refuse(f"refused: there is no image{f' {number}' if names else ''}")
             elif action == "remove":
                 name = names[number - 1]
                 self.folder.remove(name)
@@ -240,16 +252,52 @@ class LiveSession:
         else:
             self._refuse("refused: nothing to undo")
 
-    def finish(self, calibrates: bool = True) -> "RunResult | None":
-        """Calibrate all images, if `calibrates`, and return the result; None with fewer than three, or if it failed."""
-        if calibrates and self.state.result is None and len(self.folder.names) >= MIN_FRAMES:
-            self._show(f"calibrating all {len(self.folder.names)} images", is_over=True)
-            try:
-                self._show(result=self.calibration.finish())
-            except RejectedError as error:
-                self._refuse(f"no calibration: {error}")
-        self._show(self.state.event, is_refusal=self.state.is_refusal, is_over=True, is_done=True)
+    def finish(self) -> "RunResult | None":
+        """Verify the run, or calibrate all images and return the result; None with fewer than three, or if it failed.
+
+        Raises the errors of `verify`.
+        """
+        try:
+            if self.state.result is None and (step := self._last_step):
+                self._show(step, is_over=True)
+                if self.state.verifies is not None:
+                    self.verify()
+                else:
+                    self._show(result=self.calibration.finish())
+        except RejectedError as error:
+            if self.state.verifies is not None:
+                raise
+            self._refuse(f"no calibration: {error}")
+        finally:
+            self._show(self.state.event, is_refusal=self.state.is_refusal, is_over=True, is_done=True)
         return self.state.result
+
+    @property
+    def _last_step(self) -> str:
+        """Computation that follows the last image, in words; empty if there are too few images for it."""
+        count, run = len(self.folder.names), self.state.verifies
+        if run is not None:
+            return f"verifying {run} with {count_of(count, 'image')}" if count else ""
+        return f"computing the final calibration of all {count} images" if count >= MIN_FRAMES else ""
+
+    def verify(self) -> "Verification":
+        """Verify the run with the images taken so far, show the result, and return it.
+
+        Raises InputError if no run is verified, and the errors of `verify_run`.
+        """
+        from jcr.pipeline.verify import verify_run
+
+        if (run := self.state.verifies) is None:
+            raise InputError("no run is verified; start the capture with --verify OUT")
+        with self._lock:
+            self._show(self._last_step)
+            try:
+                found = verify_run(run, self.folder.folder)
+            except Exception as error:
+                self._show(f"not verified: {error}", is_refusal=True)
+                raise
+            self._show(verification=found)
+        return found
 
     def _frame(self, base_from_gripper: Float[ndarray, "4 4"]) -> Frame:
         """Return a frame taken while the gripper rests at this pose (4,4); raise InputError if none can be kept."""
@@ -288,13 +336,15 @@ class LiveSession:
             self._following = self._worker.submit(self._calibrate)
 
     def _calibrate(self) -> None:
-        """Calibrate the images if they changed.
+        """Calibrate the images if they changed; count them only if a run is verified.
 
         With --until-accurate, end the capture if the calibration of all images meets the requirement.
         """
         try:
             if tuple(self.folder.names) != self._calibrated:
-                progress = self.calibration.update()
+                names = tuple(self.folder.names)
+                is_counted = self.state.verifies is not None
+                progress = LiveProgress(images=names) if is_counted else self.calibration.update()
                 self._calibrated = progress.images
                 self._report(progress)
                 if self.options.until_accurate and progress.requirement_met:
@@ -313,9 +363,13 @@ class LiveSession:
         """Publish a new state of the calibration, on the page and through `tell`."""
         with self._changed:
             state = self.state
-            is_shown = not state.is_refusal and progress.images == state.names
+            is_shown = not state.is_refusal and not state.is_over and progress.images == state.names
             self._show("" if is_shown else state.event, is_refusal=state.is_refusal, progress=progress)
-        self._tell({"calibration": progress.as_json()}, progress_lines(progress))
+        if state.verifies is not None:
+            lines = verifying_lines(state.verifies, len(progress.images), state.most)
+            self._tell({"images": list(progress.images)}, lines)
+        else:
+            self._tell({"calibration": progress.as_json()}, progress_lines(progress))
 
     def _say(self, event: str, answer: Answer, **changes: Any) -> None:
         """Publish an event (text) on the page, and with `answer` (JSON) through `tell`."""
@@ -326,13 +380,15 @@ class LiveSession:
         """Replace `state` by a copy with this event and the fields `changes`, and notify waiting threads."""
         with self._changed:
             changes["is_over"] = self.state.is_over or changes.get("is_over", False)
-            waiting = changes.get("replaces", self.state.replaces)
+            waiting, images = changes.get("replaces", self.state.replaces), self.folder.images
+            if tuple(one.image for one in images) != self.state.names:
+                changes = {"verification": None} | changes
             self.state = replace(
                 self.state,
                 version=self.state.version + 1,
                 event=event,
                 is_refusal=is_refusal,
-                images=self.folder.images,
+                images=images,
                 can_undo=self.folder.can_undo or waiting is not None,
                 **changes,
             )
