@@ -40,6 +40,7 @@ from jcr.errors import RejectedError
 from jcr.export import ros, simulators
 from jcr.export.formats import FORMATS, export_run
 from jcr.export.options import ExportOptions, provenance
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import ROOT_FROM_OPTICAL, Similarity, apply, inverse, rotation_exp, transform
 from jcr.records import CellCamera, Intrinsics, Tracks
 from jcr.scene.cloud import read_cloud
@@ -213,6 +214,21 @@ def test_files_of_several_cameras_stand_side_by_side_and_the_hint_names_the_came
         "fixed0_hand_eye.urdf",
     }
     assert "610" in (out / "export" / "fixed0_camera_info.yaml").read_text()
+    # A rejected camera is left out of a file of all cameras, and named.
+    lost = Finding.of(FindingKind.NOT_REGISTERED, "rejects", "images", "0.png", value=3.0)
+    posed = {
+        "base_from_camera": PARENT_FROM_CHILD,
+        "uncertainty": spread,
+        "intrinsics": CAMERA.with_std(None),
+    }
+    bad = CameraPlacement.of(replace(camera, name="fixed1"), [lost], **posed)
+    write_cameras(out, CamerasFile(cameras=[place, bad], arms=[], version=jcr.__version__))
+    left_out = run_jcr("export", out, "ros2", "--parent-frame", "tool0")
+    assert "camera fixed1 is rejected" in left_out.stderr and "--force includes it" in left_out.stderr
+    assert "fixed1" not in (file := out / "export" / "hand_eye.launch.xml").read_text()
+    forced = run_jcr("export", out, "ros2", "--parent-frame", "tool0", "--force", "--overwrite")
+    assert "fixed1 is rejected" in forced.stderr and "the file contains it" in forced.stderr
+    assert "fixed1" in file.read_text() and "fixed0 is rejected" not in forced.stderr
     unnamed = run_jcr("export", out, "easy_handeye2", "--camera", "fixed0")  # states the gripper frame, too
     assert unnamed.returncode == 2 and "add --parent-frame FRAME" in unnamed.stderr
 

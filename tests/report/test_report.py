@@ -16,7 +16,10 @@ from scipy.spatial.transform import Rotation
 from chromium import Chromium
 from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
+from jcr.cli.output import VerboseOutput
+from jcr.cli.run_calibrate_batch import show
 from jcr.estimation.observability import excitation
+from jcr.findings import Finding, FindingKind
 from jcr.geometry import inverse, transform
 from jcr.number_format import decimals_of, significant
 from jcr.records import COVARIANCE_ORDER, CellCamera, Reconstruction
@@ -219,6 +222,25 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     assert scene["bases"][0]["name"] == "base of right"
 
 
+def test_rejected_cameras_are_named_on_the_page_and_in_the_terminal(run: RunResult, capsys):
+    """The page of a run whose further cameras are rejected was green, and its exit status 3."""
+    lost = Finding.of(FindingKind.NOT_REGISTERED, "rejects", "images", "a.png", value=3.0)
+    cameras = [
+        CameraPlacement.of(
+            CellCamera(name=name, mount="base", images=("a.png",), image_size=(64, 48)), [lost]
+        )
+        for name in ("left", "right")
+    ]
+    found = run.with_parts(
+        cameras=CamerasFile(cameras=cameras, arms=[], version="0.0"), cloud=None, scene=None
+    )
+    text = Elements(report_html(found)).text
+    for camera in cameras:
+        assert f"Camera {camera.name} is rejected: {camera.doubt}" in text
+    assert show(found, VerboseOutput()) == 3
+    assert "left and right are rejected;" in " ".join(capsys.readouterr().out.split())
+
+
 def test_cameras_alone_are_reported_without_tracks_points_or_map(run: RunResult):
     page = with_reconstruction(run, replace(run.reconstruction, backend="marker", tracks=NO_TRACKS))
     ids = {a.get("id") for _, a in Elements(page).found}
@@ -349,6 +371,11 @@ def test_in_a_browser(chromium: Chromium, file: Path):
 @pytest.mark.long
 def test_on_a_phone_and_in_the_dark(chromium: Chromium, file: Path):
     chromium.open(file.as_uri(), 400, phone=True)
+    chromium.js("document.getElementById('objects').open = true")
+    assert chromium.js(
+        "document.querySelector('.objects').scrollWidth <= document.querySelector('.scroll').clientWidth"
+    )
+    chromium.js("document.getElementById('objects').open = false")
     top = "document.querySelector('{}').getBoundingClientRect().top"
     assert chromium.js(f"{top.format('.verdict')} < {top.format('header .soft')}")
     # The remedy may hold a word that is longer than the window.

@@ -204,6 +204,11 @@ class CamerasFile(Part):
     arms: list[ArmPlacement]
     version: str
 
+    @property
+    def rejected(self) -> list[CameraPlacement]:
+        """Placements of the rejected cameras."""
+        return [camera for camera in self.cameras if not camera.converged]
+
     def base_from_camera(
         self,
         camera: CellCamera,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import numpy as np
 import tyro
@@ -23,6 +23,9 @@ from jcr.number_format import decimals_of
 from jcr.progress import progress_bars
 from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
+
+if TYPE_CHECKING:
+    from jcr.cell.placement import CamerasFile
 
 _CSV_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label,std"
 PRINTED_POINTS = 10
@@ -123,11 +126,24 @@ class ExportCommand:
         for words in (pair, run.root_in_words()):
             if words is not None:
                 sys.stderr.write(f"{words}\n")
+        if "others" in row.contents.split() and run.camera is None and run.run.cameras is not None:
+            _warn_of_rejected(run.run.cameras, self.export.force)
         if run.doubt is not None:
             warn(f"the calibration is rejected, and the file states the reason: {run.doubt}")
         elif (short := run.short_in_words) is not None:
             warn(short)
         return 0
+
+
+def _warn_of_rejected(cameras: "CamerasFile", force: bool) -> None:
+    """Print a warning for each rejected camera of a run: it is left out of the file, or with `force` it is in it."""
+    for camera in cameras.rejected:
+        where = "; it is left out, --force includes it"
+        if camera.parent_from_camera is None:
+            where = "; it has no pose and is left out"
+        elif force:
+            where = ", and the file contains it"
+        warn(f"camera {camera.name} is rejected ({camera.doubt}){where}")
 
 
 @dataclass(frozen=True, kw_only=True)

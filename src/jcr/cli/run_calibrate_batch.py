@@ -285,17 +285,17 @@ def show(result: "RunResult", output: VerboseOutput, *more: str) -> int:
         about = "if this accuracy is enough, else see Remedy; " * (content.short is not None) + about
         following = f"jcr export {shlex.quote(str(out))} ros2{name}  # {about}"
     lines = camera_lines(cameras)
-    if content.converged and (bad := [camera.name for camera in placed if not camera.converged]):
-        lines += labelled(
-            "Exit",
-            f"status 3: {joined(bad)} is rejected; the calibration of {result.capture.camera_name} can be used",
-        )
+    bad = [] if cameras is None else [camera.name for camera in cameras.rejected]
+    if content.converged and bad:
+        why = f"{joined(bad)} {'is' if len(bad) == 1 else 'are'} rejected"
+        can = f"the calibration of {result.capture.camera_name} can be used"
+        lines += labelled("Exit", f"status 3: {why}; {can}")
     lines += [*more, *labelled("Report", str(out / "report.html")), *labelled("Next", following)]
     if output.verbose:
         lines += ["", *details(content), *(line for camera in placed for line in camera.in_words)]
     output.result(lines, facts)
     is_reached = content.converged and content.short is None
-    return 0 if is_reached and all(camera.converged for camera in placed) else 3
+    return 0 if is_reached and not bad else 3
 
 
 def camera_lines(cameras: "CamerasFile | None") -> list[str]:

@@ -60,7 +60,7 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
     if isinstance(calibration, FailedCalibration):
         sections |= {"failure": failure_section(calibration), "images": images_section(capture)}
     else:
-        sections |= head(calibration)
+        sections |= head(calibration, result.cameras if has_images else None)
         sections |= {
             "transform": transform_section(result.solved),
             "view": scene_section(result) if is_wrist else None,

@@ -10,6 +10,7 @@ from jcr.calibration.summary import (
     leave_one_out_text,
     worst_direction,
 )
+from jcr.cell.placement import CamerasFile
 from jcr.findings import FindingKind, reached_in_words, sentence
 from jcr.number_format import significant
 from jcr.report.render import Content
@@ -19,11 +20,16 @@ Tile = tuple[str, str, str, str]
 "missed" for one that misses the required accuracy."""
 
 
-def head(calibration: AnyCalibration) -> dict[str, Content]:
-    """Return the first sections of the report by name: "verdict", "tiles" (main numbers) and, if any, "warnings"."""
+def head(calibration: AnyCalibration, cameras: CamerasFile | None = None) -> dict[str, Content]:
+    """Return the first sections of the report by name: "verdict", "tiles" (main numbers) and, if any, "warnings".
+
+    The warnings include the rejected ones of the other `cameras`, which the verdict on the calibration does not.
+    """
     sections: dict[str, Content] = {"verdict": _verdict(calibration)}
     sections["tiles"] = {"tiles": list(_tiles(calibration))}
-    return sections | ({"warnings": {"remarks": calibration.remarks}} if calibration.remarks else {})
+    rejected = () if cameras is None else cameras.rejected
+    remarks = [f"Camera {one.name} is rejected: {one.doubt}" for one in rejected] + calibration.remarks
+    return sections | ({"warnings": {"remarks": remarks}} if remarks else {})
 
 
 def failure_section(calibration: AnyCalibration) -> Content:
