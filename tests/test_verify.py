@@ -20,7 +20,6 @@ from jcr.camera import project
 from jcr.capture.formats import capture_json
 from jcr.capture.images import read_image
 from jcr.cli import dispatch
-from jcr.errors import InputError
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import smooth_errors
@@ -437,10 +436,9 @@ def touched(done: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         found = 0
         while found < 2:
             x_px = rng.uniform((80, 60), (560, 420)).round()
-            try:
-                seen, _ = surface_at(capture, reconstruction, name, x_px, "test")
-            except InputError:
+            if (surface := surface_at(capture, reconstruction, name, x_px, "test")) is None:
                 continue
+            seen = surface[0]
             # By the true transform and this image's own gripper pose, at the depth that was found.
             recon_from_camera = reconstruction.recon_from_camera[k]
             assert calibration.scale is not None
@@ -466,11 +464,36 @@ def test_true_points_agree_and_a_tip_that_is_off_is_named_by_its_mean(done, touc
     assert printed["mean_mm"][2] == pytest.approx(20, abs=3) and printed["p"] < 1e-3
 
 
+def test_rows_without_a_surface_or_repeated_are_left_out_and_named(done, touched, tmp_path, capsys):
+    """One pixel without depth refused the whole table; a row that was copied counted twice."""
+    from jcr.pipeline.touch import surface_at
+
+    _, capture, reconstruction = RunResult(done).of_wrist_camera()
+    lines = touched.read_text().splitlines()
+    name = lines[1].split(",")[0]
+    pixels = ((x, y) for x in range(0, 640, 8) for y in range(0, 480, 8))
+    at = (capture, reconstruction, name)
+    x, y = next(one for one in pixels if surface_at(*at, np.array(one, float), "test") is None)
+    short = [line.replace("images/", "") for line in lines[1:]]
+    path = tmp_path / "rows.csv"
+    path.write_text("\n".join([lines[0], *short, short[1], f"{name}, {x}, {y}, 0.5, 0, 0"]))
+    assert dispatch(["touch", str(done), str(path), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert [point["line"] for point in printed["points"]] == [2, 3, 4, 5, 6, 7]
+    assert printed["points"][0]["image"] == name
+    same, lost = printed["notes"]
+    assert "line 8" in same and "line 3" in same and f"line 9: {name}, pixel {x}, {y}" in lost
+    path.write_text("\n".join([lines[0], *short[:2], f"{name}, {x}, {y}, 0.5, 0, 0"]))
+    with refused(f"2 points with a surface .line 4: {name}, pixel {x}, {y}"):
+        touch(done, path)
+
+
 HEADER = "image, x_px, y_px, x_m, y_m, z_m\n"
 FAULTS = {
     "has no column y_px, x_m": "image, x_px\n", "line 2": f"{HEADER}images/0.png, 1, 2, a, 0, 0\n",
     "in metres": f"{HEADER}images/0.png, 1, 2, 300, 0, 0\n", "0 points; touch 3 or more": HEADER,
-    "not among the registered": HEADER + 3 * "nothing.png, 1, 2, 0, 0, 0\n",
+    "line 2: nothing.png, pixel 1, 2: nothing.png is not an image": HEADER + 3 * "nothing.png, 1, 2, 0, 0, 0\n",
+    "outside of the image": f"{HEADER}00.jpg, 700, 2, 0, 0, 0\n",
 }  # fmt: skip
 
 

@@ -475,8 +475,9 @@ class TouchCommand:
     OUT is the folder of a run, POINTS a CSV with one line per point: image, x_px, y_px (the pixel of an image of the
     run that shows the point) and x_m, y_m, z_m (the tip in the base frame when it touches the point). report.html shows
     the pixel under the pointer in an image that is opened large, and a click copies it as image,x_px,y_px. Use three or
-    more points, spread over the scene; corners and printed marks are best. The exit status is 3 if the errors are larger
-    than the reported uncertainty explains.
+    more different points, spread over the scene: printed marks and textured places on flat surfaces. Pixels at the
+    edges of objects often have no depth; their rows are left out. The exit status is 3 if the errors are larger than
+    the reported uncertainty explains.
 
     for example:
       jcr touch out/table touched.csv
@@ -505,9 +506,11 @@ class TouchCommand:
             lines += labelled("Remedy", remedy)
         lines += labelled("Mean", f"{numbers(mean, 2, '+')} mm")
         points = []
-        for image, error, std in zip(found.images, 1e3 * found.error, 1e3 * found.std, strict=True):
-            points.append({"image": image, "error_mm": error, "std_mm": std})
-            lines.append(f"{image}: {numbers(error, 2, '+')} mm (± {numbers(std, 2)})")
+        for one, error, std in zip(found.touches, 1e3 * found.error, 1e3 * found.std, strict=True):
+            points.append({"line": one.line, "image": one.image, "pixel": one.x_px})
+            points[-1] |= {"error_mm": error, "std_mm": std}
+            lines.append(f"{one}: {numbers(error, 2, '+')} mm (± {numbers(std, 2)})")
+        lines += [line for note in found.notes for line in labelled("Note", note)]
         facts = {"rms_mm": rms, "expected_mm": expected, "p": found.p_value, "mean_mm": mean}
-        self.output.result(lines, facts | {"points": points})
+        self.output.result(lines, facts | {"points": points, "notes": found.notes})
         return 3 if is_larger else 0

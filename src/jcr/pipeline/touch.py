@@ -1,7 +1,7 @@
 """Touch test: distances between points that the robot's tip touched and the same points of the surface in images."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,17 +29,36 @@ LEAST_TOUCHES = 3
 
 
 @dataclass(frozen=True)
+class Touch:
+    """Row of the CSV: a point in an image, and the position of the tip that touched the point."""
+
+    line: int
+    """Line of the file; the header is line 1."""
+    image: str
+    x_px: Float[ndarray, "2"]
+    """Pixel (x, y) of the point in the image file."""
+    tip: Float[ndarray, "3"]
+    """Position of the tip (m, base frame)."""
+
+    def __str__(self) -> str:
+        x, y = self.x_px
+        return f"line {self.line}: {self.image}, pixel {x:g}, {y:g}"
+
+
+@dataclass(frozen=True)
 class TouchTest:
     """Result of a touch test: errors at the touched points, their expected sizes, and the p-value of a χ² test."""
 
-    images: tuple[str, ...]
-    """Image in which each point was selected."""
+    touches: tuple[Touch, ...]
+    """Touched points that are compared."""
     error: Float[ndarray, "k 3"]
     """Position of the tip minus position of the surface point (m, base axes), one row per point."""
     std: Float[ndarray, "k 3"]
     """Standard deviations (m) of `error`, predicted from the covariance of the calibration and the robot's noise."""
     p_value: float
     """Probability of errors as large as these or larger, tested for all points together."""
+    notes: tuple[str, ...] = ()
+    """Rows of the CSV that are left out, and why."""
 
     @property
     def rms(self) -> float:
@@ -65,21 +84,22 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
 
     `out` is the run folder. `points` is a CSV with the columns image, x_px, y_px (pixel of the point in an image of the
     run) and x_m, y_m, z_m (position of the tip in the base frame when it touched the point). The surface point is that
-    of the nearest pixel of the image's pointmap. Raises InputError for fewer than three points, an image that is not in
-    the run, or a pixel without a surface.
+    of the nearest pixel of the image's pointmap. Rows without a surface at their pixel are left out, and equal rows
+    count once. Raises InputError for fewer than three remaining points, an image that is not in the run, or a pixel
+    outside of the image.
     """
     points = Path(points)
     run = RunResult(out)
     _, capture, reconstruction = run.of_wrist_camera()
     calibration = run.found
-    images, numbers = _read(points)
-    base_from_recon, count = calibration.base_from_recon, len(images)
+    base_from_recon = calibration.base_from_recon
+    touches, surfaces, notes = _located(points, capture, reconstruction)
+    count = len(touches)
     row_of = {capture.images[row]: k for k, row in enumerate(reconstruction.image_index)}
-    rows = np.array([row_of.get(image, -1) for image in images])
+    rows = np.array([row_of[one.image] for one in touches])
     error, in_camera, depth_std_m = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
-    for k, (image, own) in enumerate(zip(images, numbers, strict=True)):
-        found, std = surface_at(capture, reconstruction, image, own[:2], points.name)
-        error[k], depth_std_m[k] = own[2:] - base_from_recon(found), base_from_recon.scale * std
+    for k, (own, (found, std)) in enumerate(zip(touches, surfaces, strict=True)):
+        error[k], depth_std_m[k] = own.tip - base_from_recon(found), base_from_recon.scale * std
         camera = scale_translation(reconstruction.recon_from_camera[rows[k]], base_from_recon.scale)
         in_camera[k] = apply(inverse(camera), base_from_recon.scale * found)
     covariance = error_covariance(
@@ -87,7 +107,46 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     )
     squared = float(error.ravel() @ np.linalg.solve(covariance, error.ravel()))
     std = np.sqrt(np.diag(covariance)).reshape(-1, 3)
-    return TouchTest(tuple(images), error, std, float(chi2.sf(squared, error.size)))
+    return TouchTest(tuple(touches), error, std, float(chi2.sf(squared, error.size)), tuple(notes))
+
+
+def _located(
+    points: Path, capture: Capture, reconstruction: Reconstruction
+) -> tuple[list[Touch], list[tuple[Float[ndarray, "3"], float]], list[str]]:
+    """Read the CSV; return its different points with a surface, their surfaces (`surface_at`), and notes on others.
+
+    Raises InputError for fewer than LEAST_TOUCHES remaining points.
+    """
+    kept, notes = dict[tuple[object, ...], tuple[Touch, tuple[ndarray, float]]](), list[str]()
+    for given in _read(points):
+        own = replace(given, image=_image_of(points, given, capture))
+        same = (own.image, *own.x_px, *own.tip)
+        found = surface_at(capture, reconstruction, own.image, own.x_px, f"{points}: {own}")
+        if same in kept:
+            notes.append(f"{own}: the same as line {kept[same][0].line}, and counts once")
+        elif found is None:
+            notes.append(
+                f"{own}: no surface was found there, and the row is left out; choose textured, flat places"
+            )
+        else:
+            kept[same] = own, found
+    if len(kept) < LEAST_TOUCHES:
+        left = f" with a surface ({'; '.join(notes)})" if notes else ""
+        raise InputError(
+            f"{points}: {count_of(len(kept), 'point')}{left}; touch {LEAST_TOUCHES} or more, spread over the scene"
+        )
+    return [one for one, _ in kept.values()], [surface for _, surface in kept.values()], notes
+
+
+def _image_of(points: Path, touched: Touch, capture: Capture) -> str:
+    """Return the capture's name of an image, which may be given without its folder if that is unique."""
+    same = [name for name in capture.images if touched.image in (name, Path(name).name)]
+    if touched.image in same:
+        return touched.image
+    if len(same) != 1:
+        why = "is not an image of the run" if not same else f"is one of {', '.join(same)}; give one of these"
+        raise InputError(f"{points}: {touched}: {touched.image} {why}")
+    return same[0]
 
 
 def error_covariance(
@@ -135,17 +194,20 @@ def error_covariance(
 
 def surface_at(
     capture: Capture, reconstruction: Reconstruction, image: str, x_px: Float[ndarray, "2"], asked_by: str
-) -> tuple[Float[ndarray, "3"], float]:
+) -> tuple[Float[ndarray, "3"], float] | None:
     """Return the surface point at the pixel `x_px` of an image, and the standard deviation of its depth (recon units).
 
-    Both come from the pointmaps; the standard deviation is 0 where they do not state it.
+    Both come from the pointmaps; the standard deviation is 0 where they do not state it. None: the pixel has no depth.
 
     `image` is a name of the capture, `x_px` a pixel (x, y) of its distorted image; the nearest pixel of the pointmap is
-    read. Raises InputError if the image is not registered or the pixel has no depth.
+    read. Raises InputError if the image is not registered or the pixel is outside of it; `asked_by` begins the message.
     """
     rows = [k for k, row in enumerate(reconstruction.image_index) if capture.images[row] == image]
     if not rows:
         raise InputError(f"{asked_by}: {image} is not among the registered images; choose another")
+    width, height = capture.image_size
+    if not (-0.5 <= x_px[0] < width - 0.5 and -0.5 <= x_px[1] < height - 0.5):
+        raise InputError(f"{asked_by}: the pixel is outside of the image ({width} x {height} px); correct it")
     if (dense := reconstruction.pointmaps) is None:
         raise InputError(f"{asked_by}: no dense depth to read a surface from; make it with `jcr map`")
     x_px = project(dense.intrinsics, unproject(reconstruction.intrinsics, x_px))
@@ -153,16 +215,16 @@ def surface_at(
     height, width = dense.confidence.shape[1:]
     inside = 0 <= column < width and 0 <= row < height
     if not inside or not dense.confidence[rows[0], row, column] > 0:
-        raise InputError(f"{asked_by}: no surface was found at that pixel of {image}; choose textured places")
+        return None
     std = 0.0 if dense.depth_std is None else float(dense.depth_std[rows[0], row, column])
     return dense.points_in_recon[rows[0], row, column].astype(np.float64), std
 
 
-def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
-    """Read the CSV of a touch test; return the image of each point, and the numbers x_px, y_px, x_m, y_m, z_m."""
+def _read(path: Path) -> list[Touch]:
+    """Read the rows of the CSV of a touch test, in their order."""
     if not path.is_file():
         raise InputError(f"{path}: no such file; give a CSV with the columns {', '.join(CSV_COLUMNS)}")
-    images, numbers = list[str](), list[ndarray]()
+    touches = list[Touch]()
     tables = read_tables(path)
     header = decode_text(path, read_limited(path)).partition("\n")[0]
     named = [cell.strip().strip('"') for cell in re.split(r"[,;\t]", header)]
@@ -177,10 +239,5 @@ def _read(path: Path) -> tuple[list[str], list[Float[ndarray, "5"]]]:
         own = np.array(cells, dtype=np.float64)
         if not np.isfinite(own).all() or np.abs(own[2:]).max() > 100:
             raise InputError(f"{path}: line {line}: positions are finite and in metres")
-        images.append(str(cell_of["image"] or ""))
-        numbers.append(own)
-    if len(images) < LEAST_TOUCHES:
-        raise InputError(
-            f"{path}: {count_of(len(images), 'point')}; touch {LEAST_TOUCHES} or more, spread over the scene"
-        )
-    return images, numbers
+        touches.append(Touch(line, str(cell_of["image"] or ""), own[:2], own[2:]))
+    return touches
