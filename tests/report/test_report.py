@@ -8,6 +8,7 @@ import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from chromium import Chromium
 from jcr.calibration.calibrate import calibrate_reconstruction
+from jcr.calibration.summary import summary
 from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run_calibrate_batch import show
@@ -128,6 +130,7 @@ def test_numbers_are_those_of_the_calibration_file(run: RunResult, page: str):
     camera, given = run.calibration.intrinsics, run.capture.intrinsics
     assert camera is not None and given is not None and abs(camera.fx - given.fx) > 0.01
     assert f"fx {camera.fx:.2f}, fy {camera.fy:.2f}" in elements.text
+    assert "intrinsics given, refined" in elements.text
     offered = json.loads(elements.copied("the covariance"))
     assert offered["order"] == list(COVARIANCE_ORDER)
     assert np.array_equal(offered["covariance"], run.found.covariance)
@@ -220,6 +223,14 @@ def test_every_camera_of_the_cell_is_in_the_scene(run: RunResult):
     expected = camera @ inverse(run.found.gripper_from_camera) @ mount
     assert np.allclose(drawn["second"][0], expected[:3], atol=1e-5)
     assert scene["bases"][0]["name"] == "base of right"
+
+
+@pytest.mark.parametrize(("source", "words"), [("given", "given, refined"), ("estimated", "estimated")])
+def test_page_and_terminal_agree_on_the_source_of_the_intrinsics(run: RunResult, source: Any, words: str):
+    """The terminal called refined intrinsics of a fixed camera estimated, for which there is no second pair."""
+    found = replace(run.found, intrinsics_source=source, with_given_intrinsics=None)
+    page = report_html(run.with_parts(calibration=found, cloud=None, scene=None))
+    assert f"intrinsics {words}" in Elements(page).text and f"Intrinsics  {words}: fx" in summary(found)
 
 
 def test_rejected_cameras_are_named_on_the_page_and_in_the_terminal(run: RunResult, capsys):

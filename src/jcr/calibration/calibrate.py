@@ -84,6 +84,9 @@ def calibration_of(case: Case) -> Calibration:
     if distance_m is not None and case.solution is not None:
         scene = scene_uncertainty(scene_points(case.solution))
     found = advised(found, case.moving, case.options, distance_m, scene)
+    if found.intrinsics is not None:
+        source = "estimated" if case.capture.intrinsics is None else "given"
+        found = replace(found, intrinsics_source=source)
     if case.capture.intrinsics is None or distance_m is None or case.carries == "scene":
         return found
     x, uncertainty, camera = found.gripper_from_camera, found.uncertainty, found.intrinsics

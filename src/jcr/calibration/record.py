@@ -137,6 +137,9 @@ class Outcome:
     """Use of every image of the capture, in its order; of every pose pair, for a calibration from given poses."""
     intrinsics: IntrinsicsAndStd | None = None
     """Intrinsics to use together with the transform (px); None for a calibration from given poses."""
+    intrinsics_source: Literal["given", "estimated"] | None = None
+    """Source of `intrinsics`: given, or adjusted from given ones; or estimated, also where given ones did not fit the
+    images. None: not recorded."""
     findings: tuple[FindingJson, ...] = ()
     """Findings of the checks: first those that reject, then warnings, then remarks; causes before consequences."""
     frame_names: FrameNames = FrameNames()

@@ -170,12 +170,20 @@ def pair_in_words(content: Calibration) -> list[str]:
     if (camera := content.intrinsics) is None:
         return []
     given = content.with_given_intrinsics
-    how = "used" if camera.std is None else "estimated" if given is None else "given, refined"
-    use = [f"{how}: {intrinsics_in_words(camera)}; use them together with the transform"]
+    origin, used = intrinsics_origin(content), intrinsics_in_words(camera)
+    use = [f"{origin}: {used}; use them together with the transform"]
     if given is not None and content.converged and (mm := mixed_pair_mm(content)) is not None:
         pair = f"with the given ones (fx {given.intrinsics.fx:.1f}) and this transform"
         use.append(f"{pair} a point is up to {significant(mm)} mm off (jcr docs exports)")
     return use
+
+
+def intrinsics_origin(content: AnyCalibration) -> str:
+    """Return the origin of the calibration's intrinsics in words: given, refined, estimated, or used if not recorded."""
+    source, camera = content.intrinsics_source, content.intrinsics
+    if source == "given" and camera is not None and camera.std is not None:
+        return "given, refined"
+    return source or "used"
 
 
 def intrinsics_in_words(camera: Intrinsics) -> str:

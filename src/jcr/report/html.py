@@ -4,6 +4,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 
 from jcr.calibration.record import FailedCalibration, PublishedCalibration
+from jcr.calibration.summary import intrinsics_origin
 from jcr.capture.formats.capture_json import origin
 from jcr.capture.readings import decision_in_words
 from jcr.errors import InputError, count_of, printable
@@ -51,8 +52,9 @@ def report_html(result: RunResult, options: StageOptions | None = None) -> str:
         (width, height), source = capture.image_size, origin(capture.folder)
         robot = options.get("calibrate", {}).get("robot") or capture.robot
         arm = f"arm {robot}" if robot else "arm of a URDF" if capture.urdf else "arm not named"
-        refined = calibration.intrinsics != capture.intrinsics and calibration.intrinsics is not None
-        given = "estimated" if capture.intrinsics is None else "given and refined" if refined else "given"
+        given = "not given" if capture.intrinsics is None else "given"
+        if calibration.intrinsics is not None:
+            given = intrinsics_origin(calibration)
         about = f"{arm} · {capture.camera_name} camera, {width} × {height} px, intrinsics {given}"
     has_images, is_published = isinstance(capture, Capture), isinstance(calibration, PublishedCalibration)
     is_wrist, scene = has_images and capture.mount != "base", result.scene if has_images else None
