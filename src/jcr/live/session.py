@@ -297,6 +297,9 @@ class LiveSession:
                 self._show(f"not verified: {error}", is_refusal=True)
                 raise
             self._show(verification=found)
+        if not self.state.is_over:  # The result at the end is printed by the command.
+            count = count_of(len(found.images), "image")
+            self._tell({"verification": found.as_json()}, [f"{found.verdict} by {count}: {found.finding}"])
         return found
 
     def _frame(self, base_from_gripper: Float[ndarray, "4 4"]) -> Frame:
