@@ -227,16 +227,18 @@ def _tables_of(
 
 
 def _groups(documents: Sequence[Path], images: Sequence[str]) -> list[list[Path]]:
-    """Return groups of documents of one folder and ending of which each image has one, by its name or its number."""
+    """Return groups of documents of one folder and ending that have the images' names, or nearly as many numbers."""
     names = {plain_name(image) for image in images}
     groups = dict[tuple[Path, str, str], list[Path]]()
     for file in documents:
         is_like = plain_name(file.stem) in names
         template = "=" if is_like else re.sub(r"\d+", "#", file.stem)
         groups.setdefault((file.parent, file.suffix.lower(), template), []).append(file)
-    least = max(3, NEARLY * len(images))
+    numbered = max(3, NEARLY * len(images))
     return [
-        sorted(files, key=lambda one: natural(one.name)) for files in groups.values() if len(files) >= least
+        sorted(files, key=lambda one: natural(one.name))
+        for (_, _, template), files in groups.items()
+        if len(files) >= (3 if template == "=" else numbered)
     ]
 
 

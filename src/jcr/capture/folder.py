@@ -123,6 +123,12 @@ def _capture(folder: Path, found: Discovery, chosen: list[_Source], options: Rea
             unlisted.append(k)
         else:
             faults[k] = f"{file}: the row of {found.images[k]} holds no pose: {fault}; correct it"
+    if len(unlisted) > (most := tolerated(len(found.images))):
+        of, names = count_of(len(found.images), "image"), first_few([found.images[k] for k in unlisted])
+        raise InputError(
+            f"{source_of(first.table)}: {len(unlisted)} of {of} have no pose there, and at most {most} may lack one: "
+            f"{names}; add their poses, or move these images away"
+        )
     rows = [k for k in range(len(found.images)) if k not in unlisted]
     require_frames(len(rows), file, 0)
     is_decided = is_paired and len(candidates) == 1
