@@ -339,6 +339,38 @@ def test_a_row_without_a_pose_is_left_out_with_the_cell_that_is_wrong(tmp_path, 
     assert any(said in note and NAMES[2] in note for note in kept.notes), kept.notes
 
 
+@pytest.mark.parametrize("option", [None, "poses"])
+def test_images_without_a_pose_file_of_their_own_are_named(tmp_path: Path, option: str | None):
+    folder = draw(tmp_path / "all", [f"images/{k:02d}.png" for k in range(9)])
+    for k, pose in enumerate(POSES[:4]):
+        write(folder / f"poses/{k:02d}.txt", [" ".join(map(repr, row)) for row in pose.tolist()])
+    with refused("poses/0[*]: 5 of 9 images have no pose there, and at most 2 may lack one: images/04.png"):
+        jcr.read_capture(folder, ReadOptions(poses=None if option is None else folder / option))
+
+
+@pytest.mark.parametrize(("layout", "said"), [
+    ("quaternion", "quaternions in its columns qx, qy, qz, qw have the length 1.2 instead of 1; .*normalise"),
+    ("rotation", "matrices in its columns r11, r12, .* no rotations: their axes have the length 1.2"),
+    ("transform", "matrices in its columns T_00, T_01, .* no rotations: their axes have the length 1.2"),
+    ("mirrored", "no rotations: they are mirrored"),
+])  # fmt: skip
+def test_numbers_that_are_no_rotation_under_the_names_of_one_are_named(
+    tmp_path: Path, layout: str, said: str
+):
+    poses, names = POSES.copy(), [f"T_{i}{j}" for i in range(4) for j in range(4)]
+    poses[:, :3, :3] = -poses[:, :3, :3] if layout == "mirrored" else 1.2 * poses[:, :3, :3]
+    numbers = poses.reshape(-1, 16)
+    if layout == "quaternion":
+        numbers, names = rows_as("quat:xyzw", POSES) * ([1.0] * 3 + [1.2] * 4), HEADER.split(",")
+    elif layout == "rotation":
+        numbers = np.hstack([poses[:, :3, 3], poses[:, :3, :3].reshape(-1, 9)])
+        names = ["x", "y", "z", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3))]
+    rows = [",".join([*map(repr, row), name]) for row, name in zip(numbers.tolist(), NAMES, strict=True)]
+    write(draw(tmp_path) / "poses.csv", [",".join([*names, "image"]), *rows])
+    with refused(said):
+        jcr.read_capture(tmp_path)
+
+
 @pytest.mark.parametrize(("header", "cell", "said"), [
     ("x,y,z,qx,qy,qz,other", None, "its columns x, y, z, qx, qy, qz, other, image are no position with a rotation"),
     (HEADER, "nan", f"column y has no number in {COUNT} of {COUNT} rows"),

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from jcr.capture.options import tolerated
 from jcr.errors import InputError, did_you_mean, shown
 from jcr.geometry import nearest_rotation, transform
-from jcr.number_format import HUGE
+from jcr.number_format import HUGE, significant
 
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres in each unit of length."""
@@ -127,6 +127,21 @@ def rotations_of(
     else:
         made[sound] = Rotation.from_euler(notation[6:], numbers[sound] * radians).as_matrix()
     return made
+
+
+def rotation_fault(numbers: Float[ndarray, "n k"], notation: str) -> str:
+    """Return why n rows of numbers are no rotations in a notation of quaternions or matrices, with the remedy."""
+    is_quaternion = notation.startswith("quat:")
+    axes = numbers[:, None] if is_quaternion else numbers.reshape(-1, 3, 3)
+    lengths = np.linalg.norm(axes[np.isfinite(axes).all((1, 2))], axis=2)
+    low, high = (significant(float(end)) for end in np.percentile(lengths, (10, 90)))
+    size = f"the length {low}" if low == high else f"lengths of {low} to {high}"
+    if is_quaternion:
+        return f"have {size} instead of 1; correct or normalise them"
+    if (np.abs(lengths - 1) < UNIT_TOLERANCE).mean() > 0.5:
+        is_mirrored = np.median(np.linalg.det(axes)) < 0
+        return f"are no rotations: {'they are mirrored' if is_mirrored else 'their axes are oblique'}; correct them"
+    return f"are no rotations: their axes have {size} instead of 1; correct them"
 
 
 def numbers_of(rotation: Float[ndarray, "n 3 3"], notation: str) -> Float[ndarray, "n k"]:

@@ -250,8 +250,9 @@ def _stamp_columns(table: Table) -> dict[int, list[int]]:
             continue  # a turn of an axis, such as KUKA's T
         numeric = [cell for cell in cells if isinstance(cell, float)]
         rising = len(numeric) == len(cells) and bool((np.diff(numeric) >= 0).all())
+        is_place = re.search(r"\d", name or "") is not None  # T_03, an entry of a transform
         is_named = is_named and (
-            words != {"t"} or (rising and len(set(numeric)) == len(cells))
+            words != {"t"} or (rising and len(set(numeric)) == len(cells) and not is_place)
         )  # or Kawasaki's T
         if not is_named and not (name is None and k == 0 and rising and abs(numeric[0]) > 1e4):
             dated = [

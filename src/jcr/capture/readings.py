@@ -21,9 +21,10 @@ from jcr.capture.notations import (
     length_unit,
     notation_of,
     poses_of,
+    rotation_fault,
 )
 from jcr.capture.options import ReadOptions, tolerated
-from jcr.errors import InputError
+from jcr.errors import InputError, first_few
 from jcr.geometry import inverse
 from jcr.number_format import HUGE, significant
 from jcr.records import Reading
@@ -237,8 +238,15 @@ def _unnamed_poses(columns: Sequence[int], numbers: Numbers, name: str) -> list[
     """Return the poses that columns of numbers without names may hold, by their count and order.
 
     Six numbers are a position and three numbers of a rotation, in either order; seven a position and a quaternion;
-    twelve or sixteen a matrix. A quaternion or a matrix is found among more numbers by its length or its axes.
+    twelve or sixteen a matrix. A quaternion or a matrix is found among more numbers by its length or its axes. Sixteen
+    numbers with the last row 0 0 0 1 are a matrix even if it has no rotation: that row is no quaternion.
     """
+    for position, rotation, notations, zero in next(_layouts(16)) if len(columns) == 16 else ():
+        last = numbers[:, [columns[k] for k in (*zero, 15)]]
+        if (last == (0, 0, 0, 1)).all(1).sum() >= len(numbers) - tolerated(len(numbers)):
+            at, of_rotation = (tuple(columns[k] for k in places) for places in (position, rotation))
+            columns_of = {"position": at, "rotation": of_rotation, "notations": notations}
+            return [PoseColumns(**columns_of, name=name, is_named=False)]
     for group in _layouts(len(columns)) if len(columns) <= MOST_UNNAMED else ():
         found = []
         for position, rotation, notations, zero in group:
@@ -374,11 +382,13 @@ def _readings_of_columns(
     position, rotation = numbers[:, columns.position], numbers[:, columns.rotation]
     length = length_unit(position, units[0] or columns.length, where)
     direct, inverted = _directions(table, columns, options)
+    is_read = False
     for notation in notations:
         angle = angle_unit(rotation, notation, units[1] or columns.angle, where)
         poses = poses_of(position, rotation, notation, f"{length}-{angle}")
         if int(np.isnan(poses[:, 0, 0]).sum()) > tolerated(len(poses)):
             continue
+        is_read = True
         is_stated = columns.is_named or _maker_in(table.words) is not None
         decided_by = "option" if asked else "names" if is_stated and len(notations) == 1 else "numbers"
         reading = Reading(
@@ -392,6 +402,11 @@ def _readings_of_columns(
             yield reading, poses
         if inverted:
             yield replace(reading, inverted=True), inverse(poses)
+    if notations and not is_read and len(columns.rotation) != 3:
+        kind = "quaternions" if len(columns.rotation) == 4 else "matrices"
+        names = first_few([table.columns[k] or str(k + 1) for k in columns.rotation])
+        fault = rotation_fault(rotation, notations[0])
+        raise InputError(f"{where}: the {kind} in its columns {names} {fault}")
 
 
 def untaken_readings(
