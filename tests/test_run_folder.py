@@ -116,6 +116,17 @@ def test_edited_or_cut_files_refused(sound: Path, tmp_path: Path, name: str, cha
     assert not made.exists()
 
 
+def test_a_run_whose_capture_was_moved_away_says_where_it_was(sound: Path, tmp_path: Path, capsys):
+    out, gone = shutil.copytree(sound, tmp_path / "out"), tmp_path / "table"
+    state = json.loads((out / "run.json").read_text())
+    (out / "run.json").write_text(json.dumps(state | {"capture": str(gone)}))
+    for command in (["add-camera", str(out), "a.png"], ["verify", str(out), str(sound / "capture")],
+                    ["export", str(out), "colmap", str(tmp_path / "colmap")]):  # fmt: skip
+        assert dispatch(command) == 2
+        said = capsys.readouterr().err
+        assert f"made from the capture at {gone}, which is gone; move it back there, or run it again" in said
+
+
 def test_a_capture_in_a_folder_whose_name_is_not_utf8_is_refused_before_any_work():
     capture = capture_of(np.eye(4)[None], folder=Path("caf\udce9"), images=("a.png",))
     with refused("not UTF-8; rename it"):

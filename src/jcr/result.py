@@ -160,8 +160,14 @@ class RunResult:
     @cached_property
     def capture(self) -> Capture:
         """Capture of the run; raises InputError if it was moved or deleted."""
+        folder = Path(self.state.capture)
         try:
-            return read_capture(self.state.capture)
+            if not folder.exists():
+                raise InputError(
+                    f"{self.out}: was made from the capture at {folder}, which is gone; move it back there, or run it "
+                    f"again (jcr run CAPTURE {self.out})"
+                )
+            return read_capture(folder)
         except OSError as error:  # a path that is invalid for the file system
             raise InputError(f"{self.out / STATE}: capture: {error.strerror}; run `jcr run` again") from None
 
