@@ -187,13 +187,24 @@ def fixed(capture: Capture, *images: str, known: bool = True) -> CellCamera:
 @pytest.mark.parametrize("known", [True, False])
 def test_an_image_of_the_scene_places_a_fixed_camera(tabletop, whole, calibrated, known, tmp_path):
     truth, own = read_truth(tabletop), calibrated[0].camera_name
-    added = added_camera("camera", [whole.folder / whole.images[10]], None, (own,), tmp_path)
+    added = added_camera("camera", [whole.folder / whole.images[10]], None, calibrated[0], (own,), tmp_path)
     (camera,) = placed(calibrated, replace(added, intrinsics=whole.intrinsics if known else None)).cameras
     assert camera.converged and camera.parent_from_camera is not None and camera.covariance is not None
     error = step_between(camera.parent_from_camera, truth.base_from_camera[10])
     assert np.linalg.norm(error[:3]) < (0.004 if known else 0.01)
     assert error @ np.linalg.solve(camera.covariance, error) < 16.8
     assert camera.uncertainty is not None and (camera.uncertainty.at_scene_mm or np.inf) < 20
+
+
+def test_an_image_of_the_runs_capture_is_no_image_of_another_camera(whole: Capture, tmp_path: Path):
+    old, new = (tmp_path / f"{name}.jpg" for name in ("copy", "over head"))
+    old.write_bytes((whole.folder / whole.images[3]).read_bytes())
+    new.write_bytes((whole.folder / whole.images[10]).read_bytes())
+    capture = whole.of_rows(range(OLD))
+    with refused(f"copy.jpg: is the same image as {whole.images[3]} of the run's capture; take a new one"):
+        added_camera("map", [old], None, capture, (), tmp_path)
+    camera = added_camera("map", [new], None, capture, (), tmp_path)
+    assert camera.images == ("map/over head.jpg",)
 
 
 @pytest.mark.slow

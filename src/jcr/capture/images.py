@@ -2,7 +2,7 @@
 
 import io
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -152,6 +152,16 @@ def size_of_all(sizes: Mapping[str, tuple[int, int]], where: str) -> tuple[int, 
     if other := [one for one in others if one[1] != size]:
         raise other_size(f"{where}: {other[0][0]}", other[0][1], size, first)
     return size
+
+
+def require_unlike(
+    new: Mapping[str, UInt8[ndarray, "h w 3"]], old: Iterable[tuple[str, UInt8[ndarray, "h w 3"]]], of: str
+) -> None:
+    """Raise InputError if a new image has the pixels of an old one; `of` names the owner of the old ones."""
+    for before, other in old:
+        for name, image in new.items():
+            if np.array_equal(image, other):
+                raise InputError(f"{name}: is the same image as {before} of {of}; take a new one")
 
 
 def edge_width(image: UInt8[ndarray, "h w 3"]) -> float:

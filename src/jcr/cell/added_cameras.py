@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from jcr.capture.formats.capture_json import camera_entries, with_cameras
-from jcr.capture.images import read_image, size_of_all
+from jcr.capture.images import read_image, require_unlike, size_of_all
 from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.errors import InputError
 from jcr.files import path_inside, read_bytes, write_bytes, write_text
@@ -35,19 +35,32 @@ def read_added_cameras(run_folder: Path, capture: Capture) -> tuple[CellCamera, 
 
 
 def added_camera(
-    name: str, files: Sequence[Path], intrinsics: Path | None, taken: Sequence[str], folder: Path
+    name: str,
+    files: Sequence[Path],
+    intrinsics: Path | None,
+    capture: Capture,
+    taken: Sequence[str],
+    folder: Path,
 ) -> CellCamera:
     """Return a fixed camera with images copied to `folder`; raise InputError if the files cannot be of one camera.
 
-    `files` are image files. `intrinsics` is a file of intrinsics. `taken` are the names of the other cameras.
+    `files` are image files, none of which may be an image of the run's `capture`. `intrinsics` is a file of intrinsics.
+    `taken` are the names of the other cameras.
     """
     if not re.fullmatch(NAME, name):
         raise InputError(f"--name {name}: a name has letters, digits and _, and begins with a letter")
     if name in taken:
         raise InputError(f"--name {name}: the cell has a camera of that name; choose another")
-    size = size_of_all({str(file): read_image(file).shape[1::-1] for file in files}, f"--name {name}")
+    pixels = {str(file): read_image(file) for file in files}
+    size = size_of_all({file: image.shape[1::-1] for file, image in pixels.items()}, f"--name {name}")
+    if size == capture.image_size:
+        own = ((image, read_image(capture.folder / image)) for image in capture.images)
+        require_unlike(pixels, own, "the run's capture")
     known = None if intrinsics is None else intrinsics_of_file(intrinsics, size)
-    images = tuple(f"{name}/{k:03d}{file.suffix.lower()}" for k, file in enumerate(files))
+    # Messages name the copies, so they have the names of the user's files.
+    names = [re.sub(r"[^\w.() -]", "_", file.name) for file in files]
+    is_unique = len({one.casefold() for one in names}) == len(names)
+    images = tuple(f"{name}/{'' if is_unique else f'{k:03d}_'}{one}" for k, one in enumerate(names))
     for image, file in zip(images, files, strict=True):
         write_bytes(folder / image, file.read_bytes())
     return CellCamera(

@@ -20,7 +20,7 @@ from jcr.capture.checks import far_faults
 from jcr.capture.folder import require_decided
 from jcr.capture.formats import bag
 from jcr.capture.formats.capture_json import origin
-from jcr.capture.images import read_image
+from jcr.capture.images import read_image, require_unlike
 from jcr.errors import InputError, RejectedError, count_of
 from jcr.geometry import apply, inverse, motion_length, require_rigid
 from jcr.pipeline.stages import fingerprint
@@ -115,9 +115,8 @@ def require_new(then: Capture | CellCamera, old: Sequence[Image], new: NewImages
                 f"{name}: has {width}x{height} pixels, the calibration is for {wide}x{high}; take them with "
                 "the same camera and resolution"
             )
-        for before, other in zip(then.images, old, strict=True):
-            if np.array_equal(image, other):
-                raise InputError(f"{name}: is the same image as {before} of the calibration; take a new one")
+    pixels = dict(zip(new.images, new.pixels, strict=True))
+    require_unlike(pixels, zip(then.images, old, strict=True), "the calibration")
 
 
 @lru_cache(maxsize=2)

@@ -210,7 +210,7 @@ def add_camera(
         file = None if intrinsics is None else Path(intrinsics)
         taken = [known.capture.camera_name, *(one.name for one in known.others)]
         with TemporaryDirectory() as scratch:
-            camera = added_camera(name, files, file, taken, Path(scratch))
+            camera = added_camera(name, files, file, known.capture, taken, Path(scratch))
             result = make(known.with_parts(others=(*known.others, camera)), FIRST, progress)
             located = place(result, progress)
             if (found := located.cameras[-1]).doubt is not None:
