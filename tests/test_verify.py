@@ -270,6 +270,23 @@ def test_the_command_finds_a_bump_from_one_image_and_shows_what_to_do(out, captu
     assert not printed.err
 
 
+def test_the_output_says_of_which_capture_it_is_and_how_to_go_on(out, capture, x, tmp_path, capsys):
+    slipped = capture.base_from_gripper @ x @ inverse(x @ BUMP)
+    write_capture(tmp_path / "good", capture, capture.base_from_gripper, [9])
+    write_capture(tmp_path / "slip", capture, slipped, [10, 11])
+    printed = []
+    for name in ("good", "slip", "good"):
+        dispatch(["verify", str(out), str(tmp_path / name), "--quiet"])
+        printed.append(capsys.readouterr().out)
+    assert "axes) of good\n" in printed[0] and "Next" not in printed[0] and "Note" not in printed[0]
+    assert "axes) of slip\n" in printed[1] and "delete verify.json" in printed[1]
+    assert printed[2].startswith("REJECTED") and "since slip" in printed[2]
+    assert (
+        "axes) of good\n" in printed[2]
+        and "good was verified before slip, and does not count again" in printed[2]
+    )
+
+
 def test_a_start_check_in_python_counts_an_image_once(out: Path, capture: Capture):
     rng = np.random.default_rng(2)
     poses = with_robot_noise(capture.base_from_gripper, 0.2, 0.03, rng)

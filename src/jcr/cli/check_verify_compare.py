@@ -434,7 +434,10 @@ def read_captures(
 
 
 def verification_lines(found: "Verification", verbose: bool) -> list[str]:
-    """Return the lines of `jcr verify`: verdict, remedy, drift with its σ, images and warnings of each camera."""
+    """Return the lines of `jcr verify`: verdict, remedy, drift with its σ, images and warnings of each camera.
+
+    The verdict is on all captures of the history, drift and images are those of the capture that was verified last.
+    """
     std = np.sqrt(np.diag(found.covariance))
     mm, mm_std = (1e3 * part[:3] for part in (found.offset, std))
     deg, deg_std = (np.degrees(part[3:]) for part in (found.offset, std))
@@ -444,15 +447,31 @@ def verification_lines(found: "Verification", verbose: bool) -> list[str]:
     if warnings and not found.moved:
         verdict += f" with {count_of(warnings, 'warning')}"
     noticed = f"{1e3 * found.detectable[0]:.1f} mm or {np.degrees(found.detectable[1]):.2f}°"
+    of, axes = (f"of {found.name}", "gripper") if found.fixed is None else ("", "base")
     lines = [
         f"{verdict}: {found.finding}" + ("" if found.moves else f", {drift}"),
         *(labelled("Remedy", found.advice) if found.moved else ()),
-        *labelled("Drift", f"{moved} (1σ, {'gripper' if found.fixed is None else 'base'} axes)"),
-        *labelled("Images", f"{len(found.images)}; they find 9 of 10 changes of {noticed}"),
+        *labelled("Drift", f"{moved} (1σ, {axes} axes) {of}".rstrip()),
+        *labelled(
+            "Images", f"{len(found.images)} {of}".rstrip() + f"; they find 9 of 10 changes of {noticed}"
+        ),
         *(line for note in found.notes for line in labelled("WARNING", note)),
+        *_history_lines(found),
         *([f"p = {found.p_value:.2g}"] if verbose else ()),
     ]
     return [*lines, *(line for one in found.others for line in verification_lines(one, verbose))]
+
+
+def _history_lines(found: "Verification") -> list[str]:
+    """Return the lines on a capture that was verified before a later one, and on how to go on after a change."""
+    lines = list[str]()
+    if found.history and (last := found.history[-1].name) != found.name:
+        lines += labelled("Note", f"{found.name} was verified before {last}, and does not count again")
+    if found.history and found.moved:
+        repaired = "after a repair: calibrate again, or verify new images if the camera is back in its place"
+        wrong = "after a wrong check, such as one with wrong poses: delete verify.json in the run folder"
+        lines += labelled("Next", repaired, wrong)
+    return lines
 
 
 def _series(rows: Sequence["Verified"]) -> list[str]:
