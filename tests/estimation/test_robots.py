@@ -177,6 +177,10 @@ def test_poses_of_another_arm_are_refused_in_one_line():
     poses = forward_kinematics(large, postures(large, 8, spread=0.3))
     with refused(r"poses do not fit a so101: \d+ mm, .*° off; name another robot"):
         errors_of(poses, arm_named("so101"))
+    with refused("robot ur55: not known; did you mean ur5e[?]"):
+        arm_named("ur55")
+    with refused("robot arm.urdf: not known; .* another arm's urdf and joints in capture.json"):
+        arm_named("arm.urdf")
     with refused("robot ur6: not known; choose one of ur3e, .*so101"):
         arm_named("ur6")
 

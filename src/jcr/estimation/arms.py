@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray, pi
 from scipy.spatial.transform import Rotation
 
-from jcr.errors import InputError
+from jcr.errors import InputError, did_you_mean
 from jcr.estimation.kinematics import Arm
 from jcr.geometry import Transform, transform
 
@@ -174,4 +174,8 @@ def arm_named(name: str) -> Arm:
     for known, make in _ARMS.items():
         if known == name:
             return make()
-    raise InputError(f"robot {name}: not known; choose one of {', '.join(ROBOT_NAMES)}, or give a URDF")
+    like = did_you_mean(name, ROBOT_NAMES)
+    raise InputError(
+        f"robot {name}: not known{like}; choose one of {', '.join(ROBOT_NAMES)}, or leave it out and state "
+        "another arm's urdf and joints in capture.json (jcr docs captures)"
+    )
