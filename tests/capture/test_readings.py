@@ -137,7 +137,11 @@ def test_one_wrong_row_does_not_change_the_unit_of_the_others():
         (1e2 * POSITION, None, "as centimetres: say which with --pose-units mm-rad or cm-rad"),
         # An arm on a vehicle 35 m from the origin of a map, in metres; whatever unit is stated.
         *(
-            (POSITION + [35, 2, 0], stated, "base frame is far away: subtract one offset")
+            (
+                POSITION + [35, 2, 0],
+                stated,
+                "are up to 35.* m from the origin; the base frame is far away: subtract one",
+            )
             for stated in (None, "mm", "cm")
         ),
         (POSITION + [35, 2, 0], "m", "far away: subtract one offset"),

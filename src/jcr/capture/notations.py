@@ -204,7 +204,8 @@ def length_unit(position: Float[ndarray, "n 3"], stated: str | None, where: str)
     if is_map or (
         far * per > METRES_LIMIT and (stated is None or (several and spread * per <= METRES_LIMIT))
     ):
-        raise InputError(f"{where}: the positions are up to {far:.4g} from the origin; {FAR_FRAME}")
+        size = f"{far:.4g} {'m' if is_map else unit}"
+        raise InputError(f"{where}: the positions are up to {size} from the origin; {FAR_FRAME}")
     # A single transform may be that of a camera, which is near its gripper.
     if stated is None and METRES_LIMIT < far < NEAR_BASE and several:
         raise InputError(

@@ -133,7 +133,7 @@ def _dispatched(arguments: Sequence[str]) -> int:
         sys.stdout.write(f"jcr {__version__}\n")
         return 0
     if name not in COMMANDS:
-        like = did_you_mean(name, COMMANDS)
+        like = did_you_mean(name, (*COMMANDS, "--version", "--help"))
         raise InputError(f"{name!r} is not a jcr command{like}; choose from {', '.join(COMMANDS)} (--help)")
     from jcr.cli.arguments import parsed
 

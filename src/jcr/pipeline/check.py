@@ -11,7 +11,6 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from jcr.calibration.checks.images import view_findings
-from jcr.calibration.options import check_options
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.required_accuracy import requirement_of
 from jcr.calibration.robot_errors import robot_errors
@@ -27,7 +26,7 @@ from jcr.number_format import significant
 from jcr.options import checked_options
 from jcr.pipeline.backend_selection import NothingFoundError
 from jcr.pipeline.reading_decision import first_reading
-from jcr.pipeline.run import calibrate, calibrate_poses
+from jcr.pipeline.run import calibrate, calibrate_poses, require_valid
 from jcr.progress import Progress, silent
 from jcr.records import Capture, Observability, PosePairs, Uncertainty
 from jcr.result import RunOptions, RunResult, load_run
@@ -87,7 +86,7 @@ def check_capture(
     contradict each other.
     """
     options = checked_options(options, RunOptions)
-    check_options(options.calibrate)
+    require_valid(options)
     with TemporaryDirectory(prefix="jcr-check-") as scratch:
         if isinstance(capture, str | Path):
             capture = read_source(capture, into=Path(scratch) / "capture", progress=progress)

@@ -69,7 +69,7 @@ def run(
     """
     out = Path(out)
     options = checked_options(options, RunOptions)
-    _require_valid(options)
+    require_valid(options)
     if not isinstance(capture, Capture | str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
     require_folder_of_results(out)
@@ -230,7 +230,7 @@ def measure(out: str | Path) -> "Measurement":
     return measure_objects(read_cloud(run.out / CLOUD), std)
 
 
-def _require_valid(options: RunOptions) -> None:
+def require_valid(options: RunOptions) -> None:
     """Raise InputError for options that a late stage would refuse, before time is spent on the images."""
     check_options(options.calibrate)
     if options.calibrate.scale is not None:
