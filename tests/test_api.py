@@ -106,6 +106,22 @@ def test_options_take_text_for_paths_lists_for_tuples_and_name_what_they_are(tab
         checked_options(ReadOptions(), RunOptions)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
+def test_an_object_that_is_no_path_is_an_input_error(tabletop: Path):
+    """In a process of its own, because the tests check annotations."""
+    calls = (
+        *("read_capture(3)", f"calibrate(jcr.read_capture({str(tabletop)!r}), None)", "load_run(None)"),
+        *("verify_run('nowhere', 3)", "add_camera('nowhere', 'side', [3])", "export_run(None, 'ros2')"),
+        *("touch('nowhere', None)", "build_map(3).state"),
+    )
+    code = "import jcr\n" + "".join(
+        f"try: jcr.{one}\nexcept jcr.InputError as error: print(error)\n" for one in calls
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    lines = done.stdout.splitlines()
+    assert len(lines) == len(calls) and all("is no path; give text or" in line for line in lines), done
+
+
 def test_a_run_is_loaded_and_compared_by_path_record_and_matrix(tmp_path: Path):
     out = sound_run(tmp_path)
     loaded = jcr.load_run(str(out))

@@ -22,6 +22,13 @@ LONGEST_PATH = 1000
 """Largest number of characters of a path that a file names; file systems accept 4096 bytes with the folder before."""
 
 
+def as_path(path: object, what: str) -> Path:
+    """Return a path that a Python program gives; raise InputError for an object that is no path, which `what` names."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"{what}: {shown(path)} is no path; give text or a pathlib.Path")
+    return Path(path)
+
+
 @contextmanager
 def writable(path: Path) -> Iterator[None]:
     """Make the folder of `path`; raise InputError if it or a file in it cannot be made, as below a file or in /proc."""

@@ -32,7 +32,7 @@ from jcr.depth.depth_npz import DEPTH_FILE as DEPTH
 from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError, first_fault
-from jcr.files import read_bytes
+from jcr.files import as_path, read_bytes
 from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
 from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
@@ -105,7 +105,7 @@ class RunResult:
 
     def __init__(self, out: str | Path, **parts: Any) -> None:
         """Open the run folder `out`; `parts` are properties known already, such as `calibration`, which are not read."""
-        vars(self).update(parts, out=Path(out))
+        vars(self).update(parts, out=as_path(out, "out"))
 
     def with_parts(self, **parts: Any) -> "RunResult":
         """Return the result with the properties named in `parts`, such as `calibration`, replaced."""
@@ -281,4 +281,4 @@ def load_run(out: str | Path) -> RunResult:
 
     A rejected result is returned, too, with its matrix: look at `converged` before you use it.
     """
-    return RunResult(out, calibration=read_calibration(Path(out)))
+    return RunResult(out, calibration=read_calibration(as_path(out, "out")))

@@ -15,6 +15,7 @@ from jcr.capture.formats import bag, capture_json, lerobot
 from jcr.capture.notations import notation_of
 from jcr.capture.options import MIN_FRAMES, ReadOptions
 from jcr.errors import InputError, first_few
+from jcr.files import as_path
 from jcr.findings.finding import joined
 from jcr.geometry import inverse
 from jcr.options import checked_options
@@ -71,7 +72,7 @@ def read_source(
     The arguments are those of `read_capture`. A recording is not extracted again if `into` holds the frames of the same
     files and options already.
     """
-    path, options = Path(path), checked_options(options, ReadOptions)
+    path, options = as_path(path, "capture"), checked_options(options, ReadOptions)
     if not path.exists():
         raise InputError(
             f"{path}: no such capture; name a folder with a capture.json, or a file or folder of another format "
@@ -86,7 +87,7 @@ def read_source(
     elif into is None:
         raise InputError(f"{path}: its images are inside it; give a folder to extract them to: into=FOLDER")
     else:
-        folder, origin = Path(into), _origin(path, options)
+        folder, origin = as_path(into, "into"), _origin(path, options)
         file = folder / capture_json.FILE
         extra = (capture_json.read_capture_json(file).model_extra or {}) if file.is_file() else {}
         if extra.get("made_from") == origin:

@@ -18,7 +18,7 @@ from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
 from jcr.extras import extra
-from jcr.files import written_whole
+from jcr.files import as_path, written_whole
 from jcr.findings.finding import joined, sentence
 from jcr.geometry import scale_translation, transform
 from jcr.number_format import significant
@@ -109,8 +109,8 @@ def export_run(
     for a run, format, option or path that cannot be used, and RejectedError if the calibration is rejected; with
     `force` it is exported, and the file contains the reason.
     """
-    file = None if path is None else Path(path)
-    return write_run(Path(out), format, file, checked_options(options, ExportOptions))[2]
+    file = None if path is None else as_path(path, "path")
+    return write_run(as_path(out, "out"), format, file, checked_options(options, ExportOptions))[2]
 
 
 def write_run(

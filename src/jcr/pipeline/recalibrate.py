@@ -10,7 +10,7 @@ import numpy as np
 from jcr.capture.folder import require_decided
 from jcr.capture.formats import capture_json
 from jcr.errors import InputError, RejectedError
-from jcr.files import IMAGES, path_inside, write_bytes
+from jcr.files import IMAGES, as_path, path_inside, write_bytes
 from jcr.geometry import step_between
 from jcr.pipeline.options import TOLERANCE
 from jcr.pipeline.run import calibrate
@@ -60,7 +60,7 @@ def recalibrate(
     If nothing has moved, the images of the run and of `captures` are calibrated together; otherwise those of the
     captures since the last change. The new run has the options of the run, the next version, and the run as predecessor.
     """
-    run, into = RunResult(out), Path(into)
+    run, into = RunResult(out), as_path(into, "into")
     if (into / "run.json").exists():
         raise InputError(f"{into}: holds a run already; name a new folder")
     if found.moves:

@@ -23,7 +23,7 @@ from jcr.cell.added_cameras import added_camera, keep_camera
 from jcr.cell.placement import write_cameras
 from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
-from jcr.files import locked, write_text
+from jcr.files import as_path, locked, write_text
 from jcr.options import checked_options
 from jcr.pipeline.backend_selection import SIFT_SUFFICES, NothingFoundError, solved_pairs
 from jcr.pipeline.reading_decision import decided_by_images
@@ -67,7 +67,7 @@ def run(
     `calibrated` is called with the calibrated result before depth and map are computed. Raises InputError if the input
     cannot be used, and RejectedError if no camera poses are found; calibration.json then contains the reason.
     """
-    out = Path(out)
+    out = as_path(out, "out")
     options = checked_options(options, RunOptions)
     require_valid(options)
     if not isinstance(capture, Capture | str | Path):
@@ -132,7 +132,7 @@ def calibrate_poses(
     """
     from jcr.report.html import report_html
 
-    out = Path(out)
+    out = as_path(out, "out")
     with locked(out):
         start = time.perf_counter()
         content = solved_pairs(pairs, options) if method == "paper" else calibrate_pose_pairs(pairs, options)
@@ -173,7 +173,7 @@ def build_map(
     with locked(before.out):
         result = begun(before.out, before.capture, options)
         for path in add:
-            added = with_added_images(result.added, Path(path), checked_options(read, ReadOptions))
+            added = with_added_images(result.added, as_path(path, "add"), checked_options(read, ReadOptions))
             result = result.with_parts(added=added)
         return finished(make(result, FIRST, progress), REST, progress)
 
@@ -188,12 +188,12 @@ def add_camera(
 ) -> RunResult:
     """Locate a fixed camera in the base frame, from its images of the scene of the run folder `out`.
 
-    `name` is the new camera's name, `images` one or several files. `intrinsics` is a JSON file with the fields of
-    capture.json; None: the intrinsics are estimated. The camera is added to the run, to cameras.json and to the report.
+    `name` is the new camera's name, `images` one or several files. `intrinsics` is a file as for `camera_info` of
+    ReadOptions; None: the intrinsics are estimated. The camera is added to the run, to cameras.json and to the report.
     Raises InputError if the images are not from one camera or do not fit the intrinsics. Raises RejectedError, without
     writing anything, if the images do not determine the camera's pose or the run is rejected.
     """
-    files = [Path(image) for image in ([images] if isinstance(images, str | Path) else images)]
+    files = [as_path(one, name) for one in ([images] if isinstance(images, str | Path) else images)]
     if not files:
         raise InputError(f"{name}: no images; give one or more that the camera took")
     before = RunResult(out)
@@ -207,7 +207,7 @@ def add_camera(
         raise RejectedError(f"{out}: its calibration is rejected and locates no camera: {doubt}")
     with locked(before.out):
         known = begun(before.out, before.capture, options)
-        file = None if intrinsics is None else Path(intrinsics)
+        file = None if intrinsics is None else as_path(intrinsics, "intrinsics")
         taken = [known.capture.camera_name, *(one.name for one in known.others)]
         with TemporaryDirectory() as scratch:
             camera = added_camera(name, files, file, known.capture, taken, Path(scratch))
@@ -225,7 +225,7 @@ def measure(out: str | Path) -> "Measurement":
     """Measure support plane and objects of the run folder `out`; raise InputError without a map or support plane."""
     from jcr.segments.measure import measure_objects
 
-    run = RunResult(Path(out))
+    run = RunResult(out)
     std = run.scale_std  # raises InputError if there is no run
     return measure_objects(read_cloud(run.out / CLOUD), std)
 

@@ -15,6 +15,7 @@ from jcr.capture.documents import read_tables
 from jcr.capture.documents.table import decode_text, read_limited
 from jcr.distributions import chi2
 from jcr.errors import InputError, count_of
+from jcr.files import as_path
 from jcr.geometry import Poses, apply, by_similarity, inverse, scale_translation
 from jcr.records import Capture, Reconstruction
 from jcr.result import RunResult
@@ -88,7 +89,7 @@ def touch(out: str | Path, points: str | Path) -> TouchTest:
     count once. Raises InputError for fewer than three remaining points, an image that is not in the run, or a pixel
     outside of the image.
     """
-    points = Path(points)
+    points = as_path(points, "points")
     run = RunResult(out)
     _, capture, reconstruction = run.of_wrist_camera()
     calibration = run.found

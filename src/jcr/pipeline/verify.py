@@ -195,7 +195,7 @@ def verify_run(
     with the scene.
     """
     run = RunResult(out)
-    if isinstance(new, str | Path):
+    if not isinstance(new, Capture | Mapping):
         new = read_capture(new, at_least=1)
     captures = {name_of(new): new} if isinstance(new, Capture) else new
     if not captures:

@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from jcr.errors import InputError, first_fault
 from jcr.extras import extra
+from jcr.files import as_path
 from jcr.records.json_fields import Positive
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def load_map(folder: str | Path, device: str = "cpu") -> "SceneMap":
 
     Raises InputError if the map is missing, damaged or of another version of jcr, or if a package is not installed.
     """
-    path = Path(folder)
+    path = as_path(folder, "folder")
     path = path / MAP_FILE if path.is_dir() else path
     if not path.is_file():
         raise InputError(f"{path}: no map here; make one with jcr run CAPTURE OUT, or jcr map OUT")
