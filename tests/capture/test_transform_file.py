@@ -51,6 +51,9 @@ def test_several_or_no_transforms_are_refused(tmp_path: Path):
     (tmp_path / "two.xml").write_text(FILES["static.launch.xml"] + other)
     with refused("several transforms"):
         read_transform(tmp_path / "two.xml")
+    (tmp_path / "README.md").write_text(f"# Results\n\nThe transform:\n\n{FILES['matrix.txt']}\n")
+    with refused("README.md: is a text, not a document of a transform; give a file that holds only"):
+        read_transform(tmp_path / "README.md")
     (tmp_path / "none.txt").write_text("hello\n1 2 3\n")
     with refused("no transform"):
         read_transform(tmp_path / "none.txt")

@@ -304,6 +304,9 @@ def test_compared_calibrations_agree_or_differ(tmp_path: Path):
         errors = {"std_mm": [0.5] * 3, "std_deg": [0.1] * 3}
         content = {"gripper_from_camera": pose.tolist()} | errors
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
+    np.savetxt(tmp_path / "bare.txt", pose)
+    bare = run_jcr("compare", "a.json", "bare.txt", cwd=tmp_path).stdout
+    assert bare.splitlines()[0].endswith("; bare.txt states no errors") and bare.startswith("DIFFER")
     close, far, turned = (run_jcr("compare", "a.json", f"{name}.json", cwd=tmp_path) for name in "bcd")
     assert close.returncode == 0 and close.stdout.startswith("AGREE: 0.300 mm")
     assert far.returncode == 3 and far.stdout.startswith("DIFFER: 170.000 mm")

@@ -64,6 +64,8 @@ class Difference:
     """Rotation vector r (rad): R_other = exp(r)·R."""
     doubts: tuple[str | None, str | None] = (None, None)
     """Reason why each of the two calibrations is rejected; None if it is accepted or a reference without a verdict."""
+    has_errors: tuple[bool, bool] = (False, False)
+    """Whether each of the two states its errors. Those of a transform that states none count as 0."""
     sigmas: Float[ndarray, "6"] | None = None
     """Absolute translation and rotation per axis, divided by their standard deviations; None without covariances."""
     chi2: float | None = None
@@ -106,7 +108,7 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
     covariance, only the step is set.
     """
     ours, others = (_stated(one, "the calibration") for one in (calibration, other))
-    doubts = ours.doubt, others.doubt
+    doubts, has_errors = (ours.doubt, others.doubt), (bool(ours.parts), bool(others.parts))
     step = step_between(ours.gripper_from_camera, others.gripper_from_camera)
     nothing = np.zeros((6, 6))
     parts = {
@@ -118,7 +120,13 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
     calibrations = ours.calibration, others.calibration
     if not np.diag(together).all():  # no covariance is known, or both transforms are stated to be exact
         cause = likely_cause(*pair, None, calibrations)
-        return Difference(translation_m=step[:3], rotation_vector=step[3:], doubts=doubts, likely_cause=cause)
+        return Difference(
+            translation_m=step[:3],
+            rotation_vector=step[3:],
+            doubts=doubts,
+            has_errors=has_errors,
+            likely_cause=cause,
+        )
     std = np.sqrt(np.diag(together))
     weighed = np.linalg.solve(together / np.outer(std, std), step / std) / std
     squared = float(step @ weighed)
@@ -130,6 +138,7 @@ def compare(calibration: Comparable, other: Comparable) -> Difference:
         translation_m=step[:3],
         rotation_vector=step[3:],
         doubts=doubts,
+        has_errors=has_errors,
         likely_cause=None if p_value >= UNLIKELY else likely_cause(*pair, together, calibrations),
         sigmas=np.abs(step) / std,
         chi2=squared,

@@ -18,14 +18,21 @@ from jcr.geometry import transform
 ARGUMENTS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 """Arguments of ROS 2's static_transform_publisher."""
 ARRAY_SUFFIXES = (".npy", ".npz", ".mat")
+PROSE_SUFFIXES = (".md", ".rst", ".html", ".htm", ".ipynb")
+"""Endings of texts for people, whose matrices are examples."""
 
 
 def read_transform(file: Path) -> Float[ndarray, "4 4"]:
     """Read the rigid transform (m) in a file: the camera's pose in the gripper frame, as `jcr export` writes it.
 
     Read are a static_transform_publisher's arguments, the only fixed joint of a URDF, translation and rotation in YAML
-    or JSON (easy_handeye's result among them), and a 4x4 matrix. Raises InputError if the file holds none, or several.
+    or JSON (easy_handeye's result among them), and a 4x4 matrix. Raises InputError if the file holds none, or several,
+    and for a text such as a README, whatever it holds.
     """
+    if file.suffix.lower() in PROSE_SUFFIXES:
+        raise InputError(
+            f"{file}: is a text, not a document of a transform; give a file that holds only the matrix"
+        )
     text = "" if file.suffix.lower() in ARRAY_SUFFIXES else decode_text(file, read_limited(file))
     found = [*_of_arguments(text), *_of_urdf(file, text)] or _of_record(file)
     if not found:

@@ -285,6 +285,8 @@ class CompareCommand:
         if found.likely_cause is not None:
             remedy = [f"compare first {found.likely_cause}", *remedy]
         verdict = "DIFFER" if is_contradiction else "NOT DECIDED" if found.p_value is None else "AGREE"
+        if sum(found.has_errors) == 1:
+            explained += f"; {paths[found.has_errors.index(False)]} states no errors"
         if rejected:  # what is rejected states nothing of the other
             verdict, explained = "NOT DECIDED", f"; {joined(list(rejected))} is rejected"
             remedy = ["remove the cause of the rejection, calibrate again, then compare"]
