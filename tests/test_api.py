@@ -97,7 +97,7 @@ def test_options_take_text_for_paths_lists_for_tuples_and_name_what_they_are(tab
     found = checked_options({"poses": "poses.csv", "episode": [0, 2]}, ReadOptions)
     assert found == ReadOptions(poses=Path("poses.csv"), episode=(0, 2))
     assert checked_options(None, RunOptions) == RunOptions()
-    assert jcr.read_capture(str(tabletop), {"format": "capture"}).images
+    assert jcr.read_capture(str(tabletop), {"base_frame": "base"}).images
     with refused("--pose-convention 'kukka': not one of .*did you mean kuka"):
         jcr.read_capture(tabletop, {"pose_convention": "kukka"})
     with refused(r"RunOptions: map: False: give jcr.MapOptions.*None for no map"):

@@ -168,7 +168,7 @@ def build_map(
         map=checked_options(map, MapOptions),
         segment=checked_options(segment, SegmentOptions),
     )
-    _require_valid(options)
+    require_valid(options)
     require_packages("the map", "; `jcr run` and `jcr calibrate` calibrate without it")
     with locked(before.out):
         result = begun(before.out, before.capture, options)
