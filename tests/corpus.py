@@ -49,7 +49,8 @@ from simulation.ros_bag import write_bag
 SIZE = (16, 12)
 COUNT = 4
 RUN_IMAGES = 6
-FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0", frames=3)
+FRAMES = ReadOptions(base_frame="base_link", gripper_frame="tool0")
+RECORDED = replace(FRAMES, frames=3)
 Read = Callable[[Path], object]
 
 
@@ -180,7 +181,7 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
     for version in ("v2.1", "v3.0"):
         key = "observation.state"
         place = writers.write_lerobot(folder / version, [episode], version, key, names, codec=None)
-        found[f"info.json {version}"] = Target(place / "meta/info.json", source(place))
+        found[f"info.json {version}"] = Target(place / "meta/info.json", source(place, RECORDED))
     place = folder / "v2.1"
     info = Info.model_validate_json((place / "meta/info.json").read_text())
     camera = "observation.images.wrist"
@@ -192,7 +193,7 @@ def recordings(folder: Path, capture: Capture) -> dict[str, Target]:
     for kind, name, bag in kinds:
         file = write_bag(folder / bag, capture, kind, 2.0, fps=4.0, tf_hz=10.0)
         inside = next(file.glob(f"*{Path(name).suffix}")) if file.is_dir() else file
-        found[name] = Target(inside, source(file if kind == "sqlite3" else inside))
+        found[name] = Target(inside, source(file if kind == "sqlite3" else inside, RECORDED))
     return found
 
 

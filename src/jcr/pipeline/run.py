@@ -70,6 +70,8 @@ def run(
     out = as_path(out, "out")
     options = checked_options(options, RunOptions)
     require_valid(options)
+    if options.calibrate.scale is not None:
+        raise InputError("scale: is for camera poses without images (samples); leave it out")
     if not isinstance(capture, Capture | str | Path):
         raise InputError(f"{capture!r:.80}: give a capture of jcr.read_capture, or its path")
     require_folder_of_results(out)
@@ -233,17 +235,14 @@ def measure(out: str | Path) -> "Measurement":
 def require_valid(options: RunOptions) -> None:
     """Raise InputError for options that a late stage would refuse, before time is spent on the images."""
     check_options(options.calibrate)
-    if options.calibrate.scale is not None:
-        raise InputError(
-            "scale: is for camera poses without images (samples); images have no unit, leave it out"
-        )
     if options.reconstruct.board is not None:
         from jcr.boards.detection import boards
 
         boards(options.reconstruct.board)  # raises InputError if the option does not describe a board
     if options.map is not None:
         check_cloud_options(options.cloud)
-        check_map_options(options.map)
+        is_published = "paper" in (options.method, options.map.preset)
+        check_map_options(replace(options.map, preset="paper" if is_published else "default"))
         check_segment_options(options.segment)
     if options.reconstruct.device == "cuda":
         device_of(options.reconstruct)
