@@ -69,7 +69,7 @@ def decided_by_images(
     try:
         with TemporaryDirectory(prefix="jcr-moving-") as moving:
             seen = with_moving_parts(capture, Path(moving)) if capture.mount == "base" else capture
-            made = _from_images_alone(seen, board, seed, progress)
+            made, has_failed = _from_images_alone(seen, board, seed, progress)
     except RejectedError as error:
         if len(capture.candidates[0][1]) != len(capture):
             raise count_differs(capture) from None
@@ -77,37 +77,48 @@ def decided_by_images(
             f"{undecided(str(capture.source), readings)}; the images do not tell: {error.what}"
         ) from None
     decided = decide(capture, made.recon_from_camera, made.image_index)
-    # A run tests given intrinsics, and uses a board; its rows are those of all images.
-    is_of_run = board is None and capture.intrinsics is None and len(decided) == len(capture)
+    # A run tests given intrinsics unless they failed here, and uses a board; its rows are those of all images.
+    is_of_run = board is None and (capture.intrinsics is None or has_failed) and len(decided) == len(capture)
     return decided, made if is_of_run else None
 
 
-def _from_images_alone(capture: Capture, board: str | None, seed: int, progress: Progress) -> Reconstruction:
+def _from_images_alone(
+    capture: Capture, board: str | None, seed: int, progress: Progress
+) -> tuple[Reconstruction, bool]:
     """Return the reconstruction without poses: from the board if it is given and seen, else from features.
 
-    Given intrinsics with which fewer than half of the images register may be wrong, and are then estimated. Raises
+    Given intrinsics with which fewer than half of the images register may be wrong, and are then estimated. If more than
+    twice as many images register with estimated ones, the second value is true, and a warning states it. Raises
     RejectedError if the images cannot be reconstructed.
     """
     from jcr.boards.marker import reconstruct_marker
-    from jcr.sfm.colmap import MOST_ALONE, reconstruct_alone
+    from jcr.sfm.colmap import MOST_ALONE, intrinsics_not_used, reconstruct_alone, registered_with
 
     if board is not None:
         with suppress(RejectedError):
-            return reconstruct_marker(capture, board, progress)
-    failure, made = None, list[Reconstruction]()
-    free = replace(capture, intrinsics=None, intrinsics_std=None)
-    for one in (capture, free) if capture.intrinsics is not None else (capture,):
-        try:
-            made.append(reconstruct_alone(one, seed, progress))
-        except RejectedError as error:
-            failure = failure or error
-            continue
-        if 2 * len(made[-1].image_index) >= min(len(capture), MOST_ALONE):
-            break
-    if not made:
-        assert failure is not None
-        raise failure
-    return max(made, key=lambda one: len(one.image_index))
+            return reconstruct_marker(capture, board, progress), False
+    if capture.intrinsics is None:
+        return reconstruct_alone(capture, seed, progress), False
+    failure, made, of = None, None, min(len(capture), MOST_ALONE)
+    try:
+        made = reconstruct_alone(capture, seed, progress)
+    except RejectedError as error:
+        failure = error
+    before = 0 if made is None else len(made.image_index)
+    if made is not None and 2 * before >= of:
+        return made, False
+    try:
+        free = reconstruct_alone(replace(capture, intrinsics=None, intrinsics_std=None), seed, progress)
+    except RejectedError:
+        if made is None:
+            assert failure is not None
+            raise failure from None
+        return made, False
+    count = len(free.image_index)
+    if count <= 2 * before:
+        return (free if made is None or count > before else made), False
+    warning = intrinsics_not_used(registered_with(before, count, of))
+    return replace(free, warnings=(*free.warnings, warning)), True
 
 
 def first_reading(capture: Capture) -> Capture:

@@ -123,13 +123,12 @@ def reconstruct_colmap(
             left_px = 0.0 if other is None else other.compute_mean_reprojection_error()
             found = None
             if count > max(2 * registered, len(images) // 2):
-                found = f"{registered} of {len(images)} images register, with estimated ones {count}"
+                found = registered_with(registered, count, len(images))
             elif count >= max(registered, _MIN_REGISTERED) and left_px < error_px / 2:
                 found = f"the points are {error_px:.1f} px off, with estimated ones {left_px:.1f} px"
             if found is not None:
                 matched, model, matcher, like, known = others, other, free, start[0], False
-                remedy = "calibrate the camera again at this resolution, or leave them out"
-                warnings = (f"the given intrinsics are not used: with them {found}; {remedy}",)
+                warnings = (intrinsics_not_used(found),)
         if model is None or model.num_reg_images() < _MIN_REGISTERED:
             raise _not_registered(matcher, matched, model).with_more(*warnings)
         made = _adjusted(model, images, like, known, seed)
@@ -138,6 +137,17 @@ def reconstruct_colmap(
     if missing := [name for row, name in enumerate(capture.images) if row not in made.image_index]:
         notes += (f"{len(made.image_index)} of {len(capture)} images registered; not {first_few(missing)}",)
     return replace(made, notes=notes, warnings=(*warnings, *matched.warnings))
+
+
+def registered_with(given: int, estimated: int, images: int) -> str:
+    """Return how many of the `images` register with the given intrinsics, and with estimated ones, in words."""
+    return f"{given} of {images} images register, with estimated ones {estimated}"
+
+
+def intrinsics_not_used(found: str) -> str:
+    """Return the warning that the given intrinsics are not used, because of what was `found` with them."""
+    remedy = "calibrate the camera again at this resolution, or leave them out"
+    return f"the given intrinsics are not used: with them {found}; {remedy}"
 
 
 def reconstruct_alone(capture: Capture, seed: int = 0, progress: Progress = silent) -> Reconstruction:
