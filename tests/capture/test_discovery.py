@@ -188,7 +188,9 @@ def test_what_decides_the_reading_is_not_lost_for_the_run(monkeypatch: pytest.Mo
     found, kept = decided_by_images(given)
     assert tried == ["given", "free"] and found.intrinsics == made.intrinsics
     # Estimated intrinsics are not tried again in the run; a warning names the given ones.
-    assert kept is not None and "with them 0 of 12 images register, with estimated ones 12" in kept.warnings[-1]
+    assert (
+        kept is not None and "with them 0 of 12 images register, with estimated ones 12" in kept.warnings[-1]
+    )
     tried.clear()
     assert decided_by_images(capture, "chessboard:9x6:0.025")[1] is None and tried == ["board"]
 

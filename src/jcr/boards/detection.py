@@ -142,17 +142,6 @@ def _tags(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
-def charuco_board(
-    count: tuple[int, int], square: float, marker: float, tags: cv2.aruco.Dictionary
-) -> cv2.aruco.CharucoBoard:
-    """Return OpenCV's ChArUco board; its warning of a narrow border, printed by C++ code, is suppressed."""
-    before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
-    try:
-        return cv2.aruco.CharucoBoard(count, square, marker, tags)
-    finally:
-        cv2.utils.logging.setLogLevel(before)
-
-
 def _charuco(
     count: tuple[int, int], square: float, marker: float, tags: cv2.aruco.Dictionary, legacy: bool
 ) -> Detector:
@@ -163,7 +152,7 @@ def _charuco(
     """
     if marker >= square:
         raise ValueError(f"a marker of {marker} m does not fit into a square of {square} m")
-    board = charuco_board(count, square, marker, tags)
+    board = cv2.aruco.CharucoBoard(count, square, marker, tags)
     board.setLegacyPattern(legacy)
     detector = cv2.aruco.CharucoDetector(board)
     corners, shift_px = np.asarray(board.getChessboardCorners(), np.float64), _charuco_shift_px()

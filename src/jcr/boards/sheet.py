@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from jcr.boards.detection import boards, charuco_board
+from jcr.boards.detection import boards
 from jcr.errors import InputError
 
 PAPERS_MM = {"a4": (297.0, 210.0), "a3": (420.0, 297.0), "a2": (594.0, 420.0), "letter": (279.4, 215.9)}
@@ -51,7 +51,7 @@ def board_sheet(spec: str, paper: str = "a4") -> tuple[Image.Image, float]:
     square_px = int(np.ceil(LEAST_PX_PER_MM * square_mm))
     if kind == "charuco":
         tags = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, parts[3]))
-        printed = charuco_board((across, down), 1.0, float(parts[2]) / float(parts[1]), tags)
+        printed = cv2.aruco.CharucoBoard((across, down), 1.0, float(parts[2]) / float(parts[1]), tags)
         if (count := len(printed.getIds())) > len(tags.bytesList):
             raise InputError(
                 f"jcr board: {across}x{down} squares need {count} markers, but {parts[3]} has {len(tags.bytesList)}; "
