@@ -341,6 +341,10 @@ def test_long_lines_are_wrapped_below_their_label_on_a_terminal_alone(monkeypatc
 def test_wrong_input_is_refused_before_a_camera_is_opened_or_a_map_read(tmp_path: Path):
     wrong = run_jcr("capture", tmp_path / "out", "--camera", 77, "--poses", "ure:1")
     assert wrong.returncode == 2 and wrong.stderr.startswith("error: --poses ure:1: give ur:HOST")
+    wrong = run_jcr(
+        "capture", tmp_path / "out", "--camera", 77, "--poses", "http", "--verify", tmp_path / "none"
+    )
+    assert wrong.returncode == 2 and "none" in wrong.stderr and "kept" not in wrong.stderr
     (tmp_path / "file").touch()
     wrong = run_jcr("capture", tmp_path / "file" / "out", "--camera", 77)
     assert wrong.stderr == f"error: {tmp_path / 'file'}: is a file; name a folder for the results\n"

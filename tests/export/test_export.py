@@ -660,7 +660,7 @@ def test_a_file_with_other_content_is_replaced_by_overwrite_alone(done: Path, tm
     assert dispatch(other) == 2 and path.read_text() == before
     assert f"{path}: is there with other content" in capsys.readouterr().err
     with refused("--overwrite"):
-        export_run(done, "moveit", path)
+        export_run(done, "mjcf", path)
     assert dispatch([*other, "--overwrite"]) == 0 and "left_optical" in path.read_text()
     assert [file.name for file in tmp_path.iterdir()] == ["a.urdf"]
 
@@ -719,6 +719,7 @@ def test_a_rejected_calibration_is_exported_by_force_with_its_reason_in_every_fi
     (["urdf", "--voxel-size", "0.01"], "--voxel-size: the format urdf does not use it, only octomap and esdf"),
     (["octomap", "--parent-frame", "tool0"], "--parent-frame: the format octomap does not use it"),
     (["lerobot"], "no run of an episode"),
+    (["ros2", "x.launch.py", "--parent-frame", "a"], "ros2 launch reads this format from a file that ends with .xml"),
 ])  # fmt: skip
 def test_what_cannot_be_exported_is_one_line(done: Path, tmp_path, capsys, arguments: list[str], words: str):
     """In a run folder that holds its calibration and nothing else."""
@@ -728,6 +729,16 @@ def test_what_cannot_be_exported_is_one_line(done: Path, tmp_path, capsys, argum
     complaint = capsys.readouterr().err
     assert complaint.startswith("error: ") and complaint.count("\n") == 1 and words in complaint
     assert not (tmp_path / "export").exists()
+    own = [
+        "export",
+        str(tmp_path),
+        "urdf",
+        str(tmp_path / "calibration.json"),
+        "--parent-frame",
+        "a",
+        "--overwrite",
+    ]
+    assert dispatch(own) == 2 and "is a file of the run itself" in capsys.readouterr().err
     if arguments == ["fbx"]:
         assert all(row.name in complaint for row in FORMATS)
 

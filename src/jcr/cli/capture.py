@@ -20,6 +20,7 @@ from jcr.live.cameras import open_camera
 from jcr.live.robot import states_of
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from jcr.number_format import labelled
+from jcr.pipeline.options import TOLERANCE
 
 if TYPE_CHECKING:
     from jcr.result import RunResult
@@ -74,6 +75,8 @@ class CaptureCommand:
         from jcr.cli.check_verify_compare import verification_lines
         from jcr.live.calibration import LiveCalibration
         from jcr.live.server import LiveServer
+        from jcr.pipeline.verify import verifiable
+        from jcr.pipeline.verify_page import write_page
 
         options, out, states = self.session, self.out, states_of(self.poses)
         if options.until_accurate and options.require == "none":
@@ -83,6 +86,7 @@ class CaptureCommand:
             raise InputError(f"--poses {self.poses}: give ur:HOST, franka:HOST, xarm:HOST or http")
         answers, run = list[Answer](), self.verify
         if run is not None:
+            verifiable(run)
             options = replace(options, images=options.images or VERIFIED)
 
         def tell(answer: Answer, lines: list[str]) -> None:
@@ -118,7 +122,10 @@ class CaptureCommand:
             raise InputError(f"{out}: no image was kept: {why}; the same command begins again")
         facts = {"capture": str(out), "images": calibration.live.names, "answers": answers}
         if (found := session.state.verification) is not None:
-            self.output.result(verification_lines(found, False), facts | {"verification": found.as_json()})
+            assert run is not None
+            page = write_page(run, found, TOLERANCE)
+            lines = [*verification_lines(found, False), *labelled("Page", str(page))]
+            self.output.result(lines, facts | {"verification": found.as_json()})
             return 3 if found.moved else 0
         return _conclude(self, facts, result, calibration.progress.requirement_met)
 
@@ -140,7 +147,9 @@ def _conclude(
         verdict, is_sound = result.verdict, result.converged
         lines = summary(result.calibration).splitlines()
     facts |= {"result": None if result is None else str(result.out), "verdict": verdict}
-    command = f"jcr run {out} {Path('out') / Path(out).resolve().name}" if is_sound else f"jcr check {out}"
+    run = Path("out") / Path(out).resolve().name
+    run = run.with_name(f"{run.name}_run") if run.resolve() == Path(out).resolve() else run
+    command = f"jcr run {out} {run}" if is_sound else f"jcr check {out}"
     if images < MIN_FRAMES:
         command = f"the same command resumes; {MIN_FRAMES} or more images are needed"
     lines += [*labelled("Capture", f"{count_of(images, 'image')} in {out}"), *labelled("Next", command)]

@@ -151,8 +151,7 @@ def write_run(
             f"{out}: its calibration is rejected, and nothing was exported: {run.doubt}; to export it nevertheless, "
             "with this reason in the file, add --force"
         )
-    if path.is_dir() and not row.file.endswith("/"):
-        raise InputError(f"{path}: is a folder; name a file for {row.name}")
+    _require_path(out, row, path)
     if row.name == "rerun":  # The map takes seconds to load.
         extra("rerun", "rerun", "a .rrd file")
     values = [attrgetter(content)(run) for content in row.contents.split()]
@@ -172,6 +171,18 @@ def write_run(
                 "--overwrite, or name another PATH"
             )
     return run, row, path
+
+
+def _require_path(out: Path, row: ExportFormat, path: Path) -> None:
+    """Raise InputError for a path that the format cannot have, and for a file of the run itself."""
+    if path.is_file() and path.resolve().parent == out.resolve():
+        raise InputError(f"{path}: is a file of the run itself; name another one")
+    if row.name in ("ros2", "moveit") and path.suffix != (suffix := Path(row.file).suffix):
+        raise InputError(
+            f"{path}: ros2 launch reads this format from a file that ends with {suffix}; name one"
+        )
+    if path.is_dir() and not row.file.endswith("/"):
+        raise InputError(f"{path}: is a folder; name a file for {row.name}")
 
 
 class ExportedRun:

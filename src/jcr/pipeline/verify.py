@@ -180,6 +180,15 @@ def _in_words(move: Move) -> str:
     return f"{said} {did}{size} since {move.since}"
 
 
+def verifiable(out: Path) -> RunResult:
+    """Return the run in a folder; raise InputError if it cannot be verified: not of a wrist camera, or rejected."""
+    run = RunResult(out)
+    run.of_wrist_camera()
+    if not run.found.converged:
+        raise InputError(f"{out}: its rejected calibration cannot be tested; calibrate again (jcr run)")
+    return run
+
+
 def verify_run(
     out: str | Path,
     new: Capture | str | Path | Mapping[str, Capture | NewImages],
@@ -194,15 +203,13 @@ def verify_run(
     accepted calibration or the images are of another camera. Raises RejectedError if no image shares enough features
     with the scene.
     """
-    run = RunResult(out)
+    run = verifiable(Path(out))
     if not isinstance(new, Capture | Mapping):
         new = read_capture(new, at_least=1)
     captures = {name_of(new): new} if isinstance(new, Capture) else new
     if not captures:
         raise InputError(f"{out}: no captures to verify it with; name one or more")
-    _, capture, _ = run.of_wrist_camera()
-    if not run.found.converged:
-        raise InputError(f"{out}: its rejected calibration cannot be tested; calibrate again (jcr run)")
+    capture = run.capture
     with locked(run.out):
         digest = fingerprint(run.found.gripper_from_camera, capture.base_from_gripper, capture.images)
         scene, history, row = old_scene(run.out, digest), read_history(run.out, digest), 0
