@@ -180,7 +180,7 @@ def _in_words(move: Move) -> str:
     return f"{said} {did}{size} since {move.since}"
 
 
-def verifiable(out: Path) -> RunResult:
+def verifiable(out: str | Path) -> RunResult:
     """Return the run in a folder; raise InputError if it cannot be verified: not of a wrist camera, or rejected."""
     run = RunResult(out)
     run.of_wrist_camera()
@@ -203,12 +203,12 @@ def verify_run(
     accepted calibration or the images are of another camera. Raises RejectedError if no image shares enough features
     with the scene.
     """
-    run = verifiable(Path(out))
     if not isinstance(new, Capture | Mapping):
         new = read_capture(new, at_least=1)
     captures = {name_of(new): new} if isinstance(new, Capture) else new
     if not captures:
         raise InputError(f"{out}: no captures to verify it with; name one or more")
+    run = verifiable(out)
     capture = run.capture
     with locked(run.out):
         digest = fingerprint(run.found.gripper_from_camera, capture.base_from_gripper, capture.images)
