@@ -335,6 +335,9 @@ def test_long_lines_are_wrapped_below_their_label_on_a_terminal_alone(monkeypatc
         *wrapped, following = re.sub(r"\033\[[0-9;]*m", "", coloured).splitlines()
         assert following == lines[-1], "a command to copy stays on one line"
         assert wrapped == lines[:-1] if not is_terminal else max(map(len, wrapped)) <= 80
+    output.truncate(output.seek(0))
+    write_lines(["ACCEPTED (5 mm)", "ACCEPTED, BUT NOT AS EXACT AS NEEDED", "REJECTED: no"])
+    assert re.findall(r"\033\[1;(\d+)m", output.getvalue()) == ["32", "33", "31"]
     assert wrapped[1].startswith(" " * INDENT + "word") and len(wrapped) > 1
 
 

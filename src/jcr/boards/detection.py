@@ -72,8 +72,8 @@ class Board:
 
 PROBED = 3
 """Number of images, spread over the capture, in which a board is searched for thoroughly before its quick test decides
-about the others. A search in vain of 1920x1080 pixels takes 1.6 s, the quick test
-0.14 s; with one image more or fewer, 29 images take 3 s more or fewer of 20 s."""
+about the others. A search in vain of 1920x1080 pixels takes 1.6 s, the quick test 0.14 s; with one image more or fewer,
+29 images take 3 s more or fewer of 20 s."""
 GLANCE_PX = 800
 """Largest long side, px, of an image for the quick test of a chessboard; larger images are reduced to it. The quick test
 found the board in all of 20 images of five cameras in which the thorough search finds it: it misses at most one in seven

@@ -3,7 +3,6 @@
 The hooks of tyro are in its modules `_errors` and `_fields`; pyproject.toml bounds its minor version.
 """
 
-import dataclasses
 import inspect
 import io
 import shutil
@@ -11,7 +10,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import islice, takewhile
 from typing import Any, get_type_hints
 
@@ -103,7 +102,7 @@ def _as_listed(record: Any, program: str) -> Any:
     about = "\n".join(
         [inspect.getdoc(record) or "", "", "more options of this command are listed by:", *more]
     )
-    defaults = {group: dataclasses.field(default_factory=hints[group]) for group in hidden}
+    defaults = {group: field(default_factory=hints[group]) for group in hidden}
     shorter = type(record.__name__, (record,), {"__annotations__": hidden, "__doc__": about, **defaults})
     return dataclass(frozen=True, kw_only=True)(shorter)
 
@@ -156,9 +155,9 @@ def _wrapped_paragraphs() -> Iterator[None]:
 def _marked(record: Any, marker: Any) -> Iterator[str]:
     """Yield the names of the fields of a class that have a marker of tyro, such as Positional."""
     extra = get_type_hints(record, include_extras=True)
-    for field in fields(record):
-        if marker in getattr(extra[field.name], "__metadata__", ()):
-            yield field.name
+    for one in fields(record):
+        if marker in getattr(extra[one.name], "__metadata__", ()):
+            yield one.name
 
 
 def _flags(record: Any) -> Iterator[str]:
@@ -166,10 +165,10 @@ def _flags(record: Any) -> Iterator[str]:
     if is_dataclass(record):
         hints = get_type_hints(record)
         no_option = {*_marked(record, tyro.conf.Positional), *_marked(record, tyro.conf.Suppress)}
-        for field in fields(record):
-            if field.name in no_option:
+        for one in fields(record):
+            if one.name in no_option:
                 continue
-            if is_dataclass(hints[field.name]):
-                yield from _flags(hints[field.name])
+            if is_dataclass(hints[one.name]):
+                yield from _flags(hints[one.name])
             else:
-                yield f"--{'no-' * (field.default is True)}{field.name.replace('_', '-')}"
+                yield f"--{'no-' * (one.default is True)}{one.name.replace('_', '-')}"

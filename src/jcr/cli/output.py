@@ -14,8 +14,9 @@ from typing import Any
 from jcr.errors import printable
 from jcr.number_format import INDENT
 
-COLOURS = {"ACCEPTED": 32, "REJECTED": 31, "WARNING": 33}
-"""ANSI codes of the words that state a verdict or a warning at the start of a line: green, red and yellow."""
+COLOURS = {"ACCEPTED, BUT NOT AS EXACT AS NEEDED": 33, "ACCEPTED": 32, "REJECTED": 31, "WARNING": 33}
+"""ANSI codes of the words that state a verdict or a warning at the start of a line, the longest first: green where
+the exit status is 0, red for a rejection, yellow otherwise."""
 COLOURED = re.compile(rf"^({'|'.join(COLOURS)})\b")
 
 

@@ -13,7 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from jcr.calibration.record import UNCERTAINTY
 from jcr.calibration.summary import intrinsics_in_words
+from jcr.cell.placement import FILE as CAMERAS
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
@@ -23,9 +25,9 @@ from jcr.findings.finding import joined, sentence
 from jcr.geometry import scale_translation, transform
 from jcr.number_format import significant
 from jcr.options import checked_options
-from jcr.result import CALIBRATION, CLOUD, RunResult
+from jcr.result import CALIBRATION, CLOUD, DEPTH, LOG, RECONSTRUCTION, REPORT, STATE, RunResult
 from jcr.scene.cloud import read_cloud
-from jcr.scene.map_file import load_map
+from jcr.scene.map_file import MAP_FILE, load_map
 
 if TYPE_CHECKING:
     from jcr.cell.placement import CameraPlacement
@@ -52,6 +54,8 @@ class ExportFormat:
     """Options that concern the format, separated by spaces; all formats take `force` and `overwrite`."""
 
 
+OWN_FILES = (STATE, CALIBRATION, UNCERTAINTY, RECONSTRUCTION, DEPTH, CLOUD, MAP_FILE, CAMERAS, REPORT, LOG)
+"""Files of a run folder, which no export replaces."""
 TEXTS = ("ros", "simulators")
 """Modules whose writers return a text."""
 CAMERA = "parent_frame child_frame base_frame camera intrinsics"
@@ -128,16 +132,12 @@ def write_run(
         raise InputError(f"{format}: no such format{did_you_mean(format, names)}; choose {', '.join(names)}")
     if options.root_from_optical and not options.to_root:
         raise InputError("--root-from-optical: needs --to-root LINK, the link it is given in")
-    given = (one.name for one in fields(options) if getattr(options, one.name) != one.default)
-    if (
-        excess := next(
-            (one for one in given if one not in ("force", "overwrite", *row.options.split())), None
-        )
-    ) is not None:
-        takers = joined([one.name for one in FORMATS if excess in one.options.split()])
-        raise InputError(
-            f"--{excess.replace('_', '-')}: the format {format} does not use it, only {takers}; leave it out"
-        )
+    used = ("force", "overwrite", *row.options.split())
+    for one in fields(options):
+        if getattr(options, one.name) != one.default and one.name not in used:
+            takers = joined([other.name for other in FORMATS if one.name in other.options.split()])
+            flag = f"--{one.name.replace('_', '-')}"
+            raise InputError(f"{flag}: the format {format} does not use it, only {takers}; leave it out")
     # Files of several cameras stand side by side.
     own_name = row.file if options.camera is None else f"{options.camera}_{row.file}"
     path = path or out / "export" / (own_name if options.into is None else options.into.name)
@@ -175,7 +175,7 @@ def write_run(
 
 def _require_path(out: Path, row: ExportFormat, path: Path) -> None:
     """Raise InputError for a path that the format cannot have, and for a file of the run itself."""
-    if path.is_file() and path.resolve().parent == out.resolve():
+    if path.resolve().parent == out.resolve() and path.name in OWN_FILES:
         raise InputError(f"{path}: is a file of the run itself; name another one")
     if row.name in ("ros2", "moveit") and path.suffix != (suffix := Path(row.file).suffix):
         raise InputError(

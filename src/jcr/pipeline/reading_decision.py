@@ -87,9 +87,9 @@ def _from_images_alone(
 ) -> tuple[Reconstruction, bool]:
     """Return the reconstruction without poses: from the board if it is given and seen, else from features.
 
-    Given intrinsics with which fewer than half of the images register may be wrong, and are then estimated. If more than
-    twice as many images register with estimated ones, the second value is true, and a warning states it. Raises
-    RejectedError if the images cannot be reconstructed.
+    Given intrinsics with which fewer than half of the images register may be wrong, and are then estimated. If far
+    more images register with estimated ones (`registered_with`), the second value is true, and a warning states it.
+    Raises RejectedError if the images cannot be reconstructed.
     """
     from jcr.boards.marker import reconstruct_marker
     from jcr.sfm.colmap import MOST_ALONE, intrinsics_not_used, reconstruct_alone, registered_with
@@ -99,11 +99,9 @@ def _from_images_alone(
             return reconstruct_marker(capture, board, progress), False
     if capture.intrinsics is None:
         return reconstruct_alone(capture, seed, progress), False
-    failure, made, of = None, None, min(len(capture), MOST_ALONE)
-    try:
+    made, of = None, min(len(capture), MOST_ALONE)
+    with suppress(RejectedError):
         made = reconstruct_alone(capture, seed, progress)
-    except RejectedError as error:
-        failure = error
     before = 0 if made is None else len(made.image_index)
     if made is not None and 2 * before >= of:
         return made, False
@@ -111,14 +109,13 @@ def _from_images_alone(
         free = reconstruct_alone(replace(capture, intrinsics=None, intrinsics_std=None), seed, progress)
     except RejectedError:
         if made is None:
-            assert failure is not None
-            raise failure from None
+            raise
         return made, False
-    count = len(free.image_index)
-    if count <= 2 * before:
-        return (free if made is None or count > before else made), False
-    warning = intrinsics_not_used(registered_with(before, count, of))
-    return replace(free, warnings=(*free.warnings, warning)), True
+    if made is not None and len(free.image_index) <= before:
+        return made, False
+    if (found := registered_with(before, len(free.image_index), of)) is None:
+        return free, False
+    return replace(free, warnings=(*free.warnings, intrinsics_not_used(found))), True
 
 
 def first_reading(capture: Capture) -> Capture:

@@ -122,8 +122,8 @@ def reconstruct_colmap(
             count = 0 if other is None else other.num_reg_images()
             left_px = 0.0 if other is None else other.compute_mean_reprojection_error()
             found = None
-            if count > max(2 * registered, len(images) // 2):
-                found = registered_with(registered, count, len(images))
+            if (hindering := registered_with(registered, count, len(images))) is not None:
+                found = hindering
             elif count >= max(registered, _MIN_REGISTERED) and left_px < error_px / 2:
                 found = f"the points are {error_px:.1f} px off, with estimated ones {left_px:.1f} px"
             if found is not None:
@@ -139,8 +139,13 @@ def reconstruct_colmap(
     return replace(made, notes=notes, warnings=(*warnings, *matched.warnings))
 
 
-def registered_with(given: int, estimated: int, images: int) -> str:
-    """Return how many of the `images` register with the given intrinsics, and with estimated ones, in words."""
+def registered_with(given: int, estimated: int, images: int) -> str | None:
+    """Return how many of the `images` register with `given` and with `estimated` intrinsics, in words.
+
+    None unless with estimated ones half of the images and twice as many register, so that the given ones are wrong.
+    """
+    if estimated <= max(2 * given, images // 2):
+        return None
     return f"{given} of {images} images register, with estimated ones {estimated}"
 
 
