@@ -145,6 +145,22 @@ def test_each_fault_is_named_at_the_image_where_it_happens(resumed: LiveCalibrat
     assert blurred.hand_eye is not None and blurred.hand_eye.converged
 
 
+@pytest.mark.slow
+def test_a_wrong_pose_is_named_where_its_image_cannot_be_registered_with_it(
+    grown, capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Without three pairs that agree on the correction, "overlap too little" was stated in its place."""
+    monkeypatch.setattr("jcr.features.pair_search._contradicted_by_all", lambda *_: set())
+    folder = shutil.copytree(grown[0], tmp_path / "capture")
+    turned = capture.base_from_gripper[8] @ transform(rotation_exp(np.array([0.0, 2.0, 0.0])), np.zeros(3))
+    with closing(LiveCalibration(folder)) as live:
+        live.live.remove(live.live.names[-1])
+        state = live.add(image_of(capture, 8), turned)
+    (found,) = (one for one in state.findings if one.kind is FindingKind.NOT_REGISTERED)
+    assert found.images == (state.added,) and found.concerns == "poses"
+    assert "another rotation than" in found.text and "check the pose" in found.remedy
+
+
 def test_eight_used_images_confirm_an_accuracy_and_seven_do_not():
     error = LeaveOneOut(translation_mm=0.1, rotation_deg=0.01, reprojection_px=None, how="given camera poses")
     found = replace(a_hand_eye(met=True), held_out=error)

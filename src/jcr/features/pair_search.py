@@ -68,6 +68,8 @@ class MatchedPairs:
     """Two-view geometries for the mapper, by pair."""
     intrinsics: Intrinsics
     """Intrinsics at the working size, given or estimated from the gripper's angles."""
+    contradicted: tuple[Key, ...] = ()
+    """Pairs that match and are not for the mapper, because the gripper's rotation between them is another."""
     x: Transform | None = None
     """Rough estimate of gripper_from_camera by the confirmed pairs; None if they do not determine it."""
     notes: tuple[str, ...] = ()
@@ -251,7 +253,7 @@ def match_with_robot(
         found = search.gate()
     x = None
     if found.of_x is None:
-        kept, notes, warnings = search.pairs, (), ()
+        kept, contradicted, notes, warnings = search.pairs, (), (), ()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
         some = pairs_of_common_scene(features.x_px, search.intrinsics, found, motion)
@@ -262,6 +264,7 @@ def match_with_robot(
         if lonely:
             found = search.match_upright([key for key in everything if lonely & set(key)], upright, found)
         kept, notes, warnings = _pairs_to_map(search, found, names)
+        contradicted = tuple(pair.key for pair in found.contradicted if pair.key not in kept)
         x = hand_eye_of_pairs(found, motion)
     if matcher.still is not None:
         percent = 100 * matcher.still.mean()
@@ -269,7 +272,12 @@ def match_with_robot(
     report("matching", 1.0)
     geometries = {key: pair.geometry for key, pair in kept.items()}
     return MatchedPairs(
-        geometries=geometries, intrinsics=search.intrinsics, x=x, notes=notes, warnings=warnings
+        geometries=geometries,
+        intrinsics=search.intrinsics,
+        contradicted=contradicted,
+        x=x,
+        notes=notes,
+        warnings=warnings,
     )
 
 

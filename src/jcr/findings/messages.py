@@ -353,9 +353,12 @@ class FindingKind(StrEnum):
         "the gripper pose of {images[0]} is {mm:.0f} mm and {rotation_deg:.1f}° from where its image shows the "
         "gripper", "correct that pose, or remove the image")
     NOT_REGISTERED = "image not registered", KindRow("single",
-        "{images} {images:is|are} not registered: {value:.0f} other images match, but overlap too little",
-        "take the view again, nearer to the pose of a registered image, with textured objects in view",
-        means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction")
+        "{images} {images:is|are} not registered, with matches to {value:.0f} of the other images"
+        "{concerns:images=: too little overlap|poses= that show another rotation than the reported gripper poses}",
+        "{concerns:images=take the view again, nearer to the pose of a registered image, with textured objects in view|"
+        "poses=check the pose of this image, or take it again}",
+        means="while a capture is taken (`jcr capture`): its camera is not in the reconstruction",
+        help="take the view again nearer to a registered one; where its matches contradict its pose, check the pose")
     # fmt: on
 
 

@@ -192,9 +192,10 @@ class LiveCalibration:
         findings = [self._blurred[name] for name in names if name in self._blurred]
         missing = sorted(set(range(len(names))) - set(self._map.registered))
         for row in missing if len(names) >= MIN_PREDICTED_IMAGES else ():
-            matches = float(self._map.matched_with(row))
+            agreeing, contradicted = self._map.matched_with(row)
+            matches, concerns = max((agreeing, "images"), (contradicted, "poses"), key=lambda one: one[0])
             kind = FindingKind.NOT_REGISTERED
-            findings.append(Finding.of(kind, "warns", "images", names[row], value=matches))
+            findings.append(Finding.of(kind, "warns", concerns, names[row], value=float(matches)))
         if made is not None and len(rows) >= MIN_PREDICTED_IMAGES:
             most = min(OBSERVATIONS[0] * len(rows), OBSERVATIONS[1])
             some = replace(made, tracks=_longest(made.tracks, most))

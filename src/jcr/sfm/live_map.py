@@ -6,7 +6,8 @@ import pycolmap
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from jcr.features.matchers import Geometries, Matcher
+from jcr.features.matchers import Matcher
+from jcr.features.pair_search import MatchedPairs
 from jcr.features.sift import SiftFeatures
 from jcr.progress import silent
 from jcr.records import Capture, Reconstruction
@@ -35,7 +36,7 @@ class LiveMap:
         self._features = SiftFeatures([], (camera.width, camera.height), 1, silent)
         self._matcher = Matcher(self._features, camera, self._known, seed=0)
         self._names: list[str] = []
-        self._geometries: Geometries = {}
+        self._matched: MatchedPairs | None = None
         self._model: pycolmap.Reconstruction | None = None
         self._places: list[int] = []
 
@@ -44,10 +45,15 @@ class LiveMap:
         """Rows of the capture's images that have a camera pose in the map, ascending."""
         return sorted(self._places[row] for row in self._rows())
 
-    def matched_with(self, place: int) -> int:
-        """Return how many other images have verified matches to the image in row `place` of the capture."""
-        row = self._places.index(place)
-        return sum(row in key for key in self._geometries)
+    def matched_with(self, place: int) -> tuple[int, int]:
+        """Return how many other images match the image in row `place` of the capture, with and against their poses.
+
+        Against their poses are matches that the rotation of the gripper between the two images contradicts.
+        """
+        row, found = self._places.index(place), self._matched
+        pairs = ((), ()) if found is None else (found.geometries, found.contradicted)
+        agreeing, contradicted = (sum(row in key for key in keys) for keys in pairs)
+        return agreeing, contradicted
 
     def update(self, capture: Capture, new: Mapping[str, UInt8[ndarray, "h w 3"]]) -> None:
         """Update the map to the images of a capture; `new` contains, by name, the images added since the last update.
@@ -72,7 +78,7 @@ class LiveMap:
             # quarters, a real capture stays so for three more images.
             begun = None
         with quiet_colmap():
-            matched, self._model = map_images(
+            self._matched, self._model = map_images(
                 self._matcher,
                 capture.base_from_gripper[self._places],
                 self._all_intrinsics[0],
@@ -81,7 +87,6 @@ class LiveMap:
                 silent,
                 begun,
             )
-            self._geometries = matched.geometries
             if self._model is not None and self._model is not begun:
                 adjust_robustly(self._model, fix_intrinsics=self._known)
 
