@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from corpus import sound_run
+from jcr.capture.formats.capture_json import kept
 from jcr.capture.read import read_capture
 from jcr.cli import dispatch
 from jcr.files import locked, write_new, write_text, written_whole
@@ -216,3 +217,26 @@ def test_the_run_of_another_capture_is_not_overwritten(sound: Path, small_captur
     with refused("holds the run of .*; name another folder, or delete it"):
         calibrate(small_capture, sound)
     assert (sound / "calibration.json").read_bytes() == before
+
+
+def test_what_was_changed_in_python_is_what_later_commands_read(small_capture: Path, tmp_path: Path):
+    """They read the whole capture of the folder, and its poses as they stand there."""
+    capture = read_capture(small_capture)
+    corrected = capture.base_from_gripper.copy()
+    corrected[:, 2, 3] += 0.01
+    assert kept(capture, tmp_path / "same") is capture and not (tmp_path / "same").exists()
+    changed = {
+        "fewer": capture.of_rows([0, 2, 3, 4]),
+        "moved": replace(capture, base_from_gripper=corrected),
+        "unknown": replace(capture, intrinsics=None),
+        "named": replace(capture, robot="ur5e"),
+    }
+    for name, one in changed.items():
+        copy = kept(one, tmp_path / name)
+        again = read_capture(copy.folder)
+        assert copy.folder == tmp_path / name and again.images == one.images, name
+        assert np.allclose(again.base_from_gripper, one.base_from_gripper, rtol=0, atol=1e-12), name
+        assert (again.intrinsics, again.robot) == (one.intrinsics, one.robot), name
+    first = calibrate(changed["fewer"], tmp_path / "out")
+    assert RunResult(first.out).of_wrist_camera()[1].images == changed["fewer"].images
+    assert not first.is_unchanged and calibrate(changed["fewer"], tmp_path / "out").is_unchanged

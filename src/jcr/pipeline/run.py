@@ -15,7 +15,7 @@ from jcr.backends import BackendName, ReconstructOptions, device_of
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.capture.added_capture import with_added_images
-from jcr.capture.formats.capture_json import kept
+from jcr.capture.formats.capture_json import kept, origin
 from jcr.capture.formats.capture_json import read as read_kept
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
@@ -259,7 +259,9 @@ def _require_own_run(capture: Capture, out: Path) -> None:
     other = None
     with suppress(InputError):  # there is no run
         other = Path(RunResult(out).state.capture)
-    if other is not None and capture.source is None and other.is_dir() and other != capture.folder.resolve():
+    if other is None or capture.source is not None or not other.is_dir():
+        return
+    if capture.folder.resolve() not in (other, origin(other).resolve()):
         raise InputError(f"{out}: holds the run of {other}; name another folder, or delete it")
 
 

@@ -262,28 +262,46 @@ def write(folder: Path, capture: Capture, **remarks: Any) -> None:
 
     `remarks` are further entries of the file, which readers of captures ignore.
     """
+    urdf = capture.urdf
+    if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
+        write_new(
+            path_inside(folder, URDF, str(folder)), read_bytes(urdf)
+        )  # so that the folder contains the whole capture
+    write_new(folder / FILE, _content(capture, **remarks).as_text().encode())
+
+
+def _content(capture: Capture, **remarks: Any) -> CaptureFile:
+    """Return the content of the capture.json that states a capture, with `remarks` as further entries."""
     frames = []
     for row, (name, pose) in enumerate(zip(capture.images, capture.base_from_gripper, strict=True)):
         more: dict[str, Any] = {} if capture.joints is None else {"joints": capture.joints[row].tolist()}
         if capture.depths is not None and capture.depths[row] is not None:
             more["depth"] = capture.depths[row]
         frames.append(FrameEntry.model_validate({"image": name, "base_from_gripper": pose} | more))
-    urdf = capture.urdf
-    if urdf is not None and urdf.resolve() != (folder / URDF).resolve():
-        write_new(
-            path_inside(folder, URDF, str(folder)), read_bytes(urdf)
-        )  # so that the folder contains the whole capture
     named = {key: name for key, name in vars(capture.frame_names).items() if name is not None}
     optional = {
         "reading": capture.reading,
         "frame_names": named or None,
         "robot": capture.robot,
-        "urdf": None if urdf is None else URDF,
+        "urdf": None if capture.urdf is None else URDF,
         "cameras": camera_entries(capture) or None,
     }
     stated = {key: value for key, value in optional.items() if value is not None} | remarks
-    content = CaptureFile(frames=frames, **_intrinsics_entries(capture), **stated)
-    write_new(folder / FILE, content.as_text().encode())
+    return CaptureFile(frames=frames, **_intrinsics_entries(capture), **stated)
+
+
+def _is_stated(capture: Capture) -> bool:
+    """Test whether the capture.json in the folder of a capture states the same frames, intrinsics, arm and cameras."""
+    file = capture.folder / FILE
+    content = read_capture_json(file)
+    if content.cameras or len(content.frames) != len(capture):
+        stated = read(capture.folder)  # decodes all images, which tell the frames that cannot be used
+    else:
+        frames = [frame_of(content, row, file) for row in range(len(capture))]
+        images, poses = zip(*((one.image, one.base_from_gripper) for one in frames), strict=True)
+        fields = stated_fields(content, frames, capture.image_size, file)
+        stated = replace(capture, images=images, base_from_gripper=np.array(poses), **fields)
+    return stated.urdf == capture.urdf and _content(stated).as_text() == _content(capture).as_text()
 
 
 def origin(folder: Path) -> Path:
@@ -295,21 +313,21 @@ def origin(folder: Path) -> Path:
 
 
 def kept(capture: Capture, folder: Path) -> Capture:
-    """Copy the images of a capture of another format into `folder`, write a capture.json, and return the copy.
+    """Copy the images of a capture that no capture.json states into `folder`, write one, and return the copy.
 
-    A capture that was read from a capture.json is returned unchanged, without a copy. With the copy, a run can be
-    resumed without the options of the other format.
+    A capture that the capture.json in its folder states is returned unchanged, without a copy. Others were read from
+    another format, or changed in Python since, as by `Capture.of_rows`; later commands on a run read what is copied.
     """
-    if capture.source is None:
+    if capture.source is None and _is_stated(capture):
         return capture
     others = (name for camera in capture.others for name in camera.images)
     names = [*filter(None, (*capture.images, *(capture.depths or ()), *others))]
-    where = str(capture.source)
+    where = str(capture.source or capture.folder)
     sources = [capture_file(capture.folder, name, where) for name in names]
     copies = [path_inside(folder, name, where) for name in names]
     for source, copy in zip(sources, copies, strict=True):  # after every name was checked
         write_new(copy, read_bytes(source))
-    write(folder, capture, made_from=[str(capture.source)])
+    write(folder, capture, made_from=[where])
     return replace(read(folder), notes=capture.notes, untaken=capture.untaken)
 
 
