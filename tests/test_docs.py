@@ -117,6 +117,7 @@ def test_pages_are_installed_printed_listed_and_named_by_messages(capsys: pytest
     assert all(f"\n  {name} " in listed for name in ("results/speed", "api", "cli", "findings", "formats"))
     for name, said in (
         ("board", "pages that contain this word: .*markers"),
+        ("tool centre point", "pages that contain these words: .*formats"),
         ("xyzzy", "`jcr docs` lists the pages"),
         ("troubleshoot", "did you mean troubleshooting?"),
     ):

@@ -65,15 +65,15 @@ class DocsCommand:
       jcr docs results/speed
     """
 
-    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="[PAGE]")] = None
-    """Page to print; none: list them."""
+    name: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[PAGE]")] = ()
+    """Page to print, or words of which the pages that contain them are named; none: list all pages."""
     output: Output = field(default_factory=Output)
 
     def main(self) -> int:
         """Print a page of the manual, or the names and titles of all pages; return the exit status 0."""
-        if self.name is not None:
-            text = page(self.name)
-            self.output.result(text.splitlines(), {"page": self.name, "markdown": text})
+        if self.name:
+            text = page(name := " ".join(self.name))
+            self.output.result(text.splitlines(), {"page": name, "markdown": text})
             return 0
         titles, lines, section = dict[str, str](), list[str](), ""
         for name, path in pages().items():
@@ -105,11 +105,13 @@ def page(name: str) -> str:
         last = name.removesuffix(".md").rpartition("/")[2]
         name = next((one for one in (last, f"results/{last}") if one in found), name)
     if name not in found:
-        count = {other: path.read_text("utf-8").lower().count(name.lower()) for other, path in found.items()}
-        speak = sorted((other for other in found if count[other]), key=lambda other: -count[other])[
-            :MOST_NAMED
-        ]
-        there = f"pages that contain this word: {', '.join(speak)}" if speak else "`jcr docs` lists the pages"
+        words, count = name.lower().split(), dict[str, int]()
+        for other, path in found.items():
+            text = path.read_text("utf-8").lower()
+            count[other] = sum(map(text.count, words)) if all(word in text for word in words) else 0
+        speak = sorted(filter(count.get, found), key=lambda other: -count[other])[:MOST_NAMED]
+        what = "this word" if len(words) == 1 else "these words"
+        there = f"pages that contain {what}: {', '.join(speak)}" if speak else "`jcr docs` lists the pages"
         raise InputError(f"jcr docs {name}: no such page{did_you_mean(name, found)}; {there}")
     return found[name].read_text(encoding="utf-8")
 
