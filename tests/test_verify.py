@@ -280,7 +280,7 @@ def test_the_output_says_of_which_capture_it_is_and_how_to_go_on(out, capture, x
         printed.append(capsys.readouterr().out)
     assert "axes) of good\n" in printed[0] and "Next" not in printed[0] and "Note" not in printed[0]
     assert "axes) of slip\n" in printed[1] and "delete verify.json" in printed[1]
-    assert printed[2].startswith("REJECTED") and "since slip" in printed[2]
+    assert printed[2].startswith("REJECTED") and "since capture slip" in printed[2]
     assert (
         "axes) of good\n" in printed[2]
         and "good was verified before slip, and does not count again" in printed[2]

@@ -177,7 +177,7 @@ def _in_words(move: Move) -> str:
     if move.step is not None:
         mm, deg = 1e3 * np.linalg.norm(move.step[:3]), np.degrees(np.linalg.norm(move.step[3:]))
         size = f" by {mm:.2f} mm and {deg:.3f}°"
-    return f"{said} {did}{size} since {move.since}"
+    return f"{said} {did}{size} since capture {move.since}"
 
 
 def verifiable(out: str | Path) -> RunResult:
