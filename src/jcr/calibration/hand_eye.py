@@ -83,11 +83,9 @@ def solve_hand_eye(  # noqa: PLR0913 (each is a fact about the capture)
     """
     gripper = _checked(base_from_gripper, "base_from_gripper")
     camera = _checked(recon_from_camera, "recon_from_camera")
-    n = len(gripper)
-    if camera_covariance is not None and camera_covariance.shape != (6 * n, 6 * n):
-        raise InputError(
-            f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {(6 * n, 6 * n)}"
-        )
+    n, rows = len(gripper), 6 * len(gripper)
+    if camera_covariance is not None and camera_covariance.shape != (rows, rows):
+        raise InputError(f"camera_covariance: shape {camera_covariance.shape}; {n} poses need {rows, rows}")
     names = [f"pose {k}" for k in range(n)] if names is None else list(names)
     known = None if scale is None else (scale, scale_std)
     _require_possible(n, len(camera), names, known, robot_noise, camera_errors)

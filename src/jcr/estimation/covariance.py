@@ -66,8 +66,7 @@ def posterior(
     def elsewhere(solution: LinearSolution, sizes: LogSizes) -> Stack:
         """Return the covariance of the unknowns by systematic robot errors, which differ at other poses."""
         part = equations.systematic_part(sizes)
-        # The diagonal block (6,6) of each pose.
-        poses, each = part.shape[-1] // 6, np.arange(part.shape[-1] // 6)
+        each = np.arange(poses := part.shape[-1] // 6)  # the diagonal block (6,6) of each pose
         blocks = part.reshape(*part.shape[:-2], poses, 6, poses, 6)[..., each, :, each, :]
         second_moment = np.moveaxis(blocks, 0, -3)
         if expected:

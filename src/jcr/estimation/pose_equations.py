@@ -319,7 +319,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
     every_region = Region(basis, everywhere, to_unknown @ everywhere, problem.unknowns)
     systematic, *others = (arm.error_covariance for arm in problem.arms)
     systematic = np.asarray(block_diag(systematic, *others)) if others else systematic
-    bent = problem.bent
+    bent, of_arm = problem.bent, [len(one.rigs) for one in problem.arms]
     every = Equations(
         residual=residual.ravel(),
         jacobian=jacobian,
@@ -329,9 +329,7 @@ def pose_equations(problem: Problem, state: State, images: ImageEvidence | None)
         systematic=every_region.left(systematic),
         given=problem.robot_noise_floor,
         confirmed=every_region.left(bent @ bent.T) if bent.size else None,
-        arm=np.repeat(np.arange(len(problem.arms)), [len(one.rigs) for one in problem.arms])
-        if len(problem.arms) > 1
-        else None,
+        arm=np.repeat(np.arange(len(of_arm)), of_arm) if len(of_arm) > 1 else None,
     )
     return PoseEquations(every, region, used, by_rig, (follow, to_mean, covariance))
 

@@ -5,8 +5,8 @@ images are then rotated upright.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -166,6 +166,12 @@ class _Search:
             else:
                 self.pairs[key] = self.matcher.pair(self.intrinsics, key, geometry)
 
+    def matched(self, believed: Collection[Key] | None = None) -> MatchedPairs:
+        """Return the result of the search with the pairs `believed`; None: with all."""
+        pairs = {key: pair for key, pair in self.pairs.items() if believed is None or key in believed}
+        geometries = {key: pair.geometry for key, pair in pairs.items()}
+        return MatchedPairs(geometries=geometries, intrinsics=self.intrinsics)
+
     def _is_better(self, new: Pair) -> bool:
         """Test whether the new geometry of a pair replaces the one in `pairs`.
 
@@ -251,9 +257,8 @@ def match_with_robot(
     if found.of_x is None:
         search.match(dict.fromkeys(everything, as_taken))
         found = search.gate()
-    x = None
     if found.of_x is None:
-        kept, contradicted, notes, warnings = search.pairs, (), (), ()
+        matched = search.matched()
     else:
         upright = rolls(base_from_gripper[:, :3, :3] @ found.of_x.rotation)
         some = pairs_of_common_scene(features.x_px, search.intrinsics, found, motion)
@@ -263,22 +268,13 @@ def match_with_robot(
         lonely = set(np.flatnonzero(np.bincount(rows, minlength=n) < 2).tolist())
         if lonely:
             found = search.match_upright([key for key in everything if lonely & set(key)], upright, found)
-        kept, notes, warnings = _pairs_to_map(search, found, names)
-        contradicted = tuple(pair.key for pair in found.contradicted if pair.key not in kept)
-        x = hand_eye_of_pairs(found, motion)
+        matched = _pairs_to_map(search, found, names)
     if matcher.still is not None:
         percent = 100 * matcher.still.mean()
-        notes += (f"{percent:.0f} % of the image stay while the gripper moves, fingers or a logo: left out",)
+        note = f"{percent:.0f} % of the image stay while the gripper moves, fingers or a logo: left out"
+        matched = replace(matched, notes=(*matched.notes, note))
     report("matching", 1.0)
-    geometries = {key: pair.geometry for key, pair in kept.items()}
-    return MatchedPairs(
-        geometries=geometries,
-        intrinsics=search.intrinsics,
-        contradicted=contradicted,
-        x=x,
-        notes=notes,
-        warnings=warnings,
-    )
+    return matched
 
 
 def match_alone(
@@ -297,14 +293,11 @@ def match_alone(
     search.match(dict.fromkeys(combinations(range(count), 2), (0.0, 0.0)))
     search.hide_still_parts()
     report("matching", 1.0)
-    geometries = {key: pair.geometry for key, pair in search.pairs.items()}
-    return MatchedPairs(geometries=geometries, intrinsics=intrinsics)
+    return search.matched()
 
 
-def _pairs_to_map(
-    search: _Search, found: Gate, names: Sequence[str]
-) -> tuple[dict[Key, Pair], tuple[str, ...], tuple[str, ...]]:
-    """Return the pairs that are to be mapped, and notes and warnings for the user about the other pairs.
+def _pairs_to_map(search: _Search, found: Gate, names: Sequence[str]) -> MatchedPairs:
+    """Return the pairs that are to be mapped, with notes and warnings for the user about the other pairs.
 
     To be mapped are the pairs that the robot poses do not contradict, and all pairs of an image whose pose is wrong.
     Pairs too uncertain to be judged are mapped only if the intrinsics are unknown.
@@ -326,7 +319,9 @@ def _pairs_to_map(
             f"the matches of {listed} agree with each other and contradict the reported gripper rotation; check the "
             "pose of each",
         )
-    return {key: pair for key, pair in search.pairs.items() if key in believed}, notes, warnings
+    contradicted = tuple(pair.key for pair in found.contradicted if pair.key not in believed)
+    x = hand_eye_of_pairs(found, search.motion)
+    return replace(search.matched(believed), contradicted=contradicted, x=x, notes=notes, warnings=warnings)
 
 
 def _contradicted_by_all(found: Gate, motion: Motions) -> set[int]:
