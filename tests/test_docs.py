@@ -233,3 +233,41 @@ def test_a_package_that_is_there_but_broken_reports_why(tmp_path, monkeypatch: p
     monkeypatch.setitem(sys.modules, "brokenpackage", None)
     with refused("the simulation needs brokenpackage, which is not installed"):
         extra("brokenpackage", "view", "the simulation")
+
+
+def imported_by(module: Path) -> set[str]:
+    """Return the modules of jcr that a module imports, at the top, in functions, or by name in a text."""
+    found = set[str]()
+    for node in ast.walk(ast.parse(module.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            found |= {node.module, *(f"{node.module}.{one.name}" for one in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {one.name for one in node.names}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("jcr."):
+            found.add(node.value.partition(":")[0])
+    return found
+
+
+def test_the_tables_of_the_architecture_are_the_imports_of_the_code():
+    """In the table of readings no import of one of its modules by another is missing, and all lead downwards."""
+    page = (ROOT / "docs" / "explanation" / "architecture.md").read_text()
+    source = ROOT / "src" / "jcr"
+    of_section = dict(part.split("\n", 1) for part in page.split("\n## ")[1:])
+    for title, is_whole in (("A capture on its way through `jcr run`", False), ("From files to poses", True)):
+        rows = [line.split("|")[1:-1] for line in of_section[title].splitlines() if line.startswith("| `")]
+        road = [re.findall(r"`([\w/.]+)`", row[0])[0] for row in rows]
+        assert len(road) >= 8
+        for place, row in enumerate(rows):
+            file, listed = source / road[place], set(re.findall(r"`([\w/.]+)`", row[-1]))
+            files = sorted(file.rglob("*.py")) if file.is_dir() else [file]
+            known = set[str]().union(*map(imported_by, files))
+
+            def uses(name: str, known: set[str] = known) -> bool:
+                """Test whether a module or package, such as capture/read.py or capture/formats/, is imported."""
+                dotted = "jcr." + name.removesuffix(".py").strip("/").replace("/", ".")
+                return any(one == dotted or one.startswith(f"{dotted}.") for one in known)
+
+            assert all((source / name).exists() and uses(name) for name in listed), (road[place], listed)
+            if is_whole:
+                assert {name for name in road if name != road[place] and uses(name)} == listed, road[place]
+                assert not listed & set(road[: place + 1]), road[place]
