@@ -98,7 +98,8 @@ def path_inside(folder: Path, name: str, where: str, *asked: Path) -> Path:
         raise InputError(f"{where}: {shown(name)} is a link back to itself; put a file there") from None
     if not any(place.is_relative_to(root.resolve()) for root in (folder, *asked)):
         raise InputError(
-            f"{where}: {shown(name)} is a link that leads out of {folder}; copy the file into it"
+            f"{where}: {shown(name)} is a link that leads out of {folder}; copy the file into it, or make its folder "
+            f"{IMAGES} the link"
         )
     try:
         is_wrong = target.exists() and not target.is_file()  # opening a pipe would block for ever
