@@ -21,12 +21,13 @@ from jcr.capture.readings import readings_of
 from jcr.errors import RejectedError
 from jcr.estimation.pose_misfit import Misfit, pose_misfit
 from jcr.geometry import inverse, transform
-from jcr.pipeline.reading_decision import decide, decided_by_images
+from jcr.pipeline.reading_decision import _from_images_alone, decide, decided_by_images
+from jcr.progress import silent
 from jcr.records import Capture, Reconstruction
 from refusal import refused
 from scenes import capture_of, reconstruction_of
 from simulation.layouts import LAYOUTS, Layout
-from simulation.problems import HandEyeProblem, hand_eye_problem
+from simulation.problems import INTRINSICS, HandEyeProblem, hand_eye_problem
 from simulation.recordings import simulated_recordings
 
 COUNT = 6
@@ -402,3 +403,32 @@ def test_misspelt_keys_of_a_capture_are_named(small_capture: Path, tmp_path: Pat
     (folder / "capture.json").write_text(json.dumps(content))
     (note,) = jcr.read_capture(folder).notes
     assert note.endswith("'distorsion' is not used; did you mean distortion?")
+
+
+@pytest.mark.parametrize(
+    ("given", "estimated", "registered", "are_named"),
+    [
+        (6, 12, 6, False),
+        (5, 12, 12, True),
+        (5, 10, 10, False),
+        (0, 6, 6, False),
+        (0, 7, 7, True),
+        (4, 4, 4, False),
+    ],
+)
+def test_given_intrinsics_are_named_where_few_images_register_with_them(
+    given: int, estimated: int, registered: int, are_named: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """Of twelve images; 0 stands for a failed reconstruction. Half of the images are enough for the given ones."""
+
+    def reconstruct(capture: Capture, *_: object) -> Reconstruction:
+        count = estimated if capture.intrinsics is None else given
+        if not count:
+            raise RejectedError("no images register")
+        return replace(reconstruction_of(PROBLEM.recon_from_camera[:count]), image_index=np.arange(count))
+
+    monkeypatch.setattr("jcr.sfm.colmap.reconstruct_alone", reconstruct)
+    capture = capture_of(PROBLEM.base_from_gripper[:12], intrinsics=INTRINSICS)
+    made, has_failed = _from_images_alone(capture, None, 0, silent)
+    assert (len(made.image_index), has_failed) == (registered, are_named)
+    assert bool(made.warnings) is are_named
