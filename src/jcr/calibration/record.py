@@ -370,8 +370,9 @@ class Calibration(Outcome):
 
         `pixel` (…,2) are pixels (x, y) of the distorted image, `depth_m` (…) the z coordinates in the camera frame.
         `base_from_gripper` (4,4) is the reported gripper pose of the image. The covariances include the errors of
-        intrinsics, transform and reported gripper pose, but not those of `pixel` and `depth_m`. Raises InputError for a
-        fixed camera, without intrinsics, for a pixel outside of the image, and for a depth or pose that cannot be.
+        intrinsics, transform and reported gripper pose, but not those of `pixel` and `depth_m`: add the variance of your
+        depth along the ray. Raises InputError for a fixed camera, without intrinsics, for a pixel outside of the image,
+        and for a depth or pose that cannot be.
         """
         x = self.gripper_from_camera
         if self.intrinsics is None:

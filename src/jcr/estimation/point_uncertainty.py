@@ -40,14 +40,22 @@ SCENE_POINTS = 300
 
 
 def point_covariance(
-    x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+    x: Transform,
+    uncertainty: Uncertainty,
+    intrinsics: Intrinsics,
+    x_px: Pixels,
+    distance_m: Distances,
+    by_scale: bool = True,
 ) -> Covariances:
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
     `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
-    of the distorted image, `distance_m` (...) distances (m) along the ray; their relative error is that of the scale.
+    of the distorted image, `distance_m` (...) distances (m) along the ray. `by_scale`: the distances are those of the
+    reconstruction, whose relative error is that of the scale; False: they were measured otherwise, and are exact.
     """
     by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
+    if not by_scale:
+        by[..., SCALE] = 0.0
     return by @ covariance @ np.swapaxes(by, -1, -2)
 
 
@@ -62,14 +70,15 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
 ) -> tuple[Float[ndarray, "*points 3"], Covariances]:
     """Return base-frame coordinates (m) and covariance (m²) of points at pixels with z = `depth_m` in the camera frame.
 
-    `x` is gripper_from_camera; `uncertainty` and `x_px` are those of `point_covariance`. `noise` adds the errors of the
-    gripper pose, for a pose in the workspace of the capture.
+    `x` is gripper_from_camera; `uncertainty` and `x_px` are those of `point_covariance`. The depths are exact, as if a
+    depth camera had measured them. `noise` adds the errors of the gripper pose, for a pose in the workspace of the
+    capture.
     """
     ray = unproject(intrinsics, x_px)
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
     p_in_gripper = apply(x, np.asarray(depth_m)[..., None] * ray / ray[..., 2:])
     base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
-    in_camera = point_covariance(x, uncertainty, intrinsics, x_px, distance_m)
+    in_camera = point_covariance(x, uncertainty, intrinsics, x_px, distance_m, by_scale=False)
     lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
     square = lever @ np.swapaxes(lever, -1, -2)
     covariance = base_from_camera_axes @ in_camera @ base_from_camera_axes.T
