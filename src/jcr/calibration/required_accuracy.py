@@ -46,7 +46,9 @@ def advised(
     x, uncertainty = hand_eye.parent_from_camera, hand_eye.uncertainty
     if distance_m is None:
         distance_m = median_distance(gripper[hand_eye.inliers] @ x)
-    seen = seen_points(x, uncertainty, hand_eye.intrinsics, distance_m)
+    # A fixed camera has no map, so that the depth of its points is measured by another sensor.
+    has_map = hand_eye.mount == "gripper"
+    seen = seen_points(x, uncertainty, hand_eye.intrinsics, distance_m, by_scale=has_map)
     uncertainty = replace(uncertainty, seen=seen, scene=scene)
     findings = tuple(
         _as_remark(one, distance_m, 1e-3 * seen.within_95_mm)

@@ -93,16 +93,20 @@ def bounds_at(
     intrinsics: Intrinsics,
     x_px: Float[ndarray, "2"],
     distance_m: float,
+    by_scale: bool = True,
 ) -> PointUncertainty:
     """Return 95 % bounds of the error of the point at `distance_m` (m) along the ray of the pixel `x_px`.
 
     Bounds are of the position (mm; whole, across and along the ray), the ray's direction and the rotation (degrees).
-    The error is relative to the gripper. `x` is gripper_from_camera; `uncertainty` is that of `point_covariance`.
+    The error is relative to the gripper. `x` is gripper_from_camera; `uncertainty` and `by_scale` are those of
+    `point_covariance`.
     """
     ray = unproject(intrinsics, x_px)
     # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
     by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
+    if not by_scale:
+        by[..., SCALE] = 0.0
     by = axes @ by
     moved = by @ covariance @ by.T
     # A translation does not change the direction. The third row becomes the rotation about the ray.
@@ -120,17 +124,22 @@ def bounds_at(
 
 
 def seen_points(
-    x: Transform, uncertainty: Uncertainty, camera: Intrinsics | None, distance_m: float
+    x: Transform,
+    uncertainty: Uncertainty,
+    camera: Intrinsics | None,
+    distance_m: float,
+    by_scale: bool = True,
 ) -> PointUncertaintyOverImage:
     """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` along the ray.
 
-    The worst corner has the largest 95 % bound of the position. `uncertainty` is that of `point_covariance`, `x` is
-    gripper_from_camera. `camera` None (given camera poses): a point on the optical axis, without errors of intrinsics.
+    The worst corner has the largest 95 % bound of the position. `uncertainty` and `by_scale` are those of
+    `point_covariance`, `x` is gripper_from_camera. `camera` None (given camera poses): a point on the optical axis,
+    without errors of intrinsics.
     """
     camera = camera or NORMALIZED  # whose image is one pixel, on the optical axis
     right, bottom = camera.width - 1.0, camera.height - 1.0
     centre, *corners = (
-        bounds_at(x, uncertainty, camera, np.array(x_px), distance_m)
+        bounds_at(x, uncertainty, camera, np.array(x_px), distance_m, by_scale)
         for x_px in ((right / 2, bottom / 2), (0.0, 0.0), (0.0, bottom), (right, 0.0), (right, bottom))
     )
     return PointUncertaintyOverImage(**vars(centre), corners=max(corners, key=lambda one: one.within_95_mm))
