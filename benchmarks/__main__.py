@@ -171,7 +171,7 @@ def write_index(out: Path) -> None:
         "# Results",
         "",
         "Written by `python -m benchmarks`; each page has its command, commit and machine. `python -m benchmarks all` "
-        f"takes 45 minutes of two cores, with one case in {SHARE} where the command has `--every {SHARE}`. "
+        f"takes 50 minutes of two cores, with one case in {SHARE} where the command has `--every {SHARE}`. "
         "`python -m benchmarks NAME docs/results` takes all of "
         "one page.",
     ]
