@@ -203,10 +203,8 @@ def _seen_row(preset: PresetName, count: int, known: Knowledge, draws: int) -> S
         scale, camera = recon_frame(found, tracks)[0], found.problem.intrinsics(found.state)[0]
         # Errors of points in axes of the estimated camera, and their stated covariance.
         x, x_px = found.state.x[0], nine_pixels(known.camera)
-        true, uncertainty = (
-            placed(problem.gripper_from_camera, known.camera, x_px, DISTANCE_M),
-            uncertainty_of(found),
-        )
+        uncertainty = uncertainty_of(found)
+        true = placed(problem.gripper_from_camera, known.camera, x_px, DISTANCE_M)
         off = (true - placed(x, camera, x_px, DISTANCE_M * scale / problem.scale)) @ x[:3, :3]
         covariance = point_covariance(x, uncertainty, camera, x_px, DISTANCE_M)
         exact = point_covariance(x, uncertainty, camera, x_px, DISTANCE_M, by_scale=False)

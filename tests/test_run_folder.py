@@ -237,6 +237,9 @@ def test_what_was_changed_in_python_is_what_later_commands_read(small_capture: P
         assert copy.folder == tmp_path / name and again.images == one.images, name
         assert np.allclose(again.base_from_gripper, one.base_from_gripper, rtol=0, atol=1e-12), name
         assert (again.intrinsics, again.robot) == (one.intrinsics, one.robot), name
+    shutil.copytree(small_capture / "images", tmp_path / "bare" / "images")
+    bare = replace(capture, folder=tmp_path / "bare")
+    assert read_capture(kept(bare, tmp_path / "made").folder).images == capture.images
     first = calibrate(changed["fewer"], tmp_path / "out")
     assert RunResult(first.out).of_wrist_camera()[1].images == changed["fewer"].images
     assert not first.is_unchanged and calibrate(changed["fewer"], tmp_path / "out").is_unchanged

@@ -56,7 +56,9 @@ def advised(
         if one.kind is not FindingKind.NOT_EXACT_ENOUGH
     )
     arm_known = hand_eye.joint_offsets is not None
-    required, missed = requirement_of(x, uncertainty, findings, hand_eye.images_used, options, arm_known)
+    required, missed = requirement_of(
+        x, uncertainty, findings, hand_eye.images_used, options, arm_known, has_map
+    )
     made = replace(hand_eye, uncertainty=uncertainty, requirement=required, findings=findings)
     return made.with_findings(*missed)
 
@@ -79,12 +81,13 @@ def requirement_of(
     images: int,
     options: CalibrateOptions,
     arm_known: bool = False,
+    has_map: bool = True,
 ) -> tuple[Requirement | None, tuple[Finding, ...]]:
     """Return the required and reached accuracy, and a finding if it is missed by a calibration that nothing rejects.
 
     `x` is gripper_from_camera, `uncertainty` has the uncertainty of points (`seen`), and `findings` are those of the
-    calibration. `images` is the number of used images, `arm_known` whether the arm's joints are modelled. The first is
-    None if no accuracy is required or it is unknown.
+    calibration. `images` is the number of used images, `arm_known` whether the arm's joints are modelled, `has_map`
+    whether depths may have the scale of a map. The first is None if no accuracy is required or it is unknown.
     """
     seen = uncertainty.seen
     if options.require == "none" or seen is None:
@@ -100,7 +103,9 @@ def requirement_of(
         return required, ()
     if required.met:
         return replace(required, more_images=0), ()
-    more = max(FORECAST_IMAGES - images, 0) or _more_images(x, uncertainty, findings, images, required)
+    more = max(FORECAST_IMAGES - images, 0) or _more_images(
+        x, uncertainty, findings, images, required, has_map
+    )
     required = replace(required, more_images=more)
     main_part = None if uncertainty.budget is None else uncertainty.budget.main_part
     concerns: Concerns = "images" if more is not None else "none"
@@ -116,7 +121,7 @@ def requirement_of(
         factor = 1 / (1 - 1 / np.sqrt(2 * images))
         in_mm, in_deg = factor * required.translation_mm, factor * required.rotation_deg
         eased = replace(required, translation_mm=in_mm, rotation_deg=in_deg)
-        if _more_images(x, uncertainty, findings, images, eased) is not None:
+        if _more_images(x, uncertainty, findings, images, eased, has_map) is not None:
             required, concerns = replace(required, more_images=IMAGES_FIRST), "images"
     size = 1e-3 * required.reached_mm
     return required, (
@@ -125,7 +130,12 @@ def requirement_of(
 
 
 def _more_images(
-    x: Transform, uncertainty: Uncertainty, findings: Sequence[Finding], images: int, required: Requirement
+    x: Transform,
+    uncertainty: Uncertainty,
+    findings: Sequence[Finding],
+    images: int,
+    required: Requirement,
+    has_map: bool,
 ) -> int | None:
     """Return the number of images to add until a missed accuracy is reached; None above MOST_MORE_IMAGES.
 
@@ -141,7 +151,7 @@ def _more_images(
     if (budget := uncertainty.budget) is not None:
         lasting.append(budget.robot_systematic)
     of_lasting = Uncertainty(covariance=sum(lasting, start=np.zeros((7, 7))))
-    left = seen_points(x, of_lasting, None, 1e-3 * required.distance_mm)
+    left = seen_points(x, of_lasting, None, 1e-3 * required.distance_mm, by_scale=has_map)
     more = 0
     for bound, limit, least in (
         (required.reached_mm, required.translation_mm, left.within_95_mm),

@@ -53,9 +53,7 @@ def point_covariance(
     of the distorted image, `distance_m` (...) distances (m) along the ray. `by_scale`: the distances are those of the
     reconstruction, whose relative error is that of the scale; False: they were measured otherwise, and are exact.
     """
-    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
-    if not by_scale:
-        by[..., SCALE] = 0.0
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m, by_scale)
     return by @ covariance @ np.swapaxes(by, -1, -2)
 
 
@@ -104,9 +102,7 @@ def bounds_at(
     ray = unproject(intrinsics, x_px)
     # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
-    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
-    if not by_scale:
-        by[..., SCALE] = 0.0
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m, by_scale)
     by = axes @ by
     moved = by @ covariance @ by.T
     # A translation does not change the direction. The third row becomes the rotation about the ray.
@@ -250,13 +246,18 @@ def scene_points(solution: Solution) -> ScenePoints:
 
 
 def _derivatives(
-    x: Transform, uncertainty: Uncertainty, intrinsics: Intrinsics, x_px: Pixels, distance_m: Distances
+    x: Transform,
+    uncertainty: Uncertainty,
+    intrinsics: Intrinsics,
+    x_px: Pixels,
+    distance_m: Distances,
+    by_scale: bool = True,
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "j j"]]:
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns, and their covariance.
 
     The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale, the intrinsics if
     estimated, the coefficients of the distortion that the model cannot express, and the extrapolated part of the
-    distortion. `distance_m` is along the ray.
+    distortion. `distance_m` is along the ray; the scale changes it if `by_scale`.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     ray = unproject(intrinsics, x_px)
@@ -266,6 +267,7 @@ def _derivatives(
     by_pixel = distance[..., None] * across_lines(unit)[..., :2] @ by_ray / length
     camera_from_gripper_axes = x[:3, :3].T
     by_unknown = by_similarity(distance * unit)
+    by_unknown[..., SCALE] *= by_scale
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
     columns, covariance, by_intrinsics = [by_unknown], uncertainty.whole, by_parameters(intrinsics, ray)

@@ -36,8 +36,8 @@ PLACE_M, LEAST_POINTS, CHANGED = 0.1, 20, 0.1
 """Side (m) of the cubes in which the scene is compared, the fewest points of a cube, and the share of points left below
 which the scene has changed there. In six real captures views from other poses keep 12 % or more in each unchanged cube;
 where objects were pushed away at most 8 % are met by chance. With 0.15 one of the six has a false place, with 0.05 half
-of the true ones are missed. JPEG takes faint features away: of nine
-captures, whose other half was verified, quality 100 gave one with a false place, 60 two, and 25 three."""
+of the true ones are missed. JPEG takes faint features away: of nine captures whose other half was verified, quality 100
+gave one with a false place, 60 two, and 25 three."""
 MOST_PLACES = 3
 FEATURES, FORMAT = "features.npz", "jcr.features/1"
 """File of the features of the calibration's images, which a verification finds once; half of its time otherwise."""

@@ -293,6 +293,8 @@ def _content(capture: Capture, **remarks: Any) -> CaptureFile:
 def _is_stated(capture: Capture) -> bool:
     """Test whether the capture.json in the folder of a capture states the same frames, intrinsics, arm and cameras."""
     file = capture.folder / FILE
+    if not file.is_file():  # a program made the record of its own images and poses
+        return False
     content = read_capture_json(file)
     if content.cameras or len(content.frames) != len(capture):
         stated = read(capture.folder)  # decodes all images, which tell the frames that cannot be used
