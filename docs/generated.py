@@ -23,7 +23,7 @@ from pydantic import TypeAdapter
 import jcr
 from jcr.backends import BACKENDS
 from jcr.calibration.record import Calibration
-from jcr.cell.placement import CamerasFile
+from jcr.cell.cameras_json import CamerasFile
 from jcr.cli import COMMANDS, dispatch
 from jcr.depth.depth_npz import DepthHeader as DepthAbout
 from jcr.findings import FindingKind

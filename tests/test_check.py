@@ -71,7 +71,8 @@ def test_nothing_is_stated_of_an_undecided_reading(small_capture: Path, tmp_path
 
 def test_a_motion_that_is_expected_to_miss_the_required_accuracy_is_not_accepted(small_capture: Path):
     capture = jcr.read_capture(small_capture)
-    few, all_of_them = (check_capture(capture.of_rows(range(n)), look=False) for n in (3, len(capture)))
+    required = {"calibrate": {"require": (12.0, 1.0)}}
+    few, all_of_them = (check_capture(capture.of_rows(range(n)), False, required) for n in (3, len(capture)))
     assert few.verdict == "accepted, but not as exact as needed" and few.expected is not None
     assert all_of_them.verdict == "accepted", all_of_them
     assert (

@@ -25,7 +25,7 @@ from jcr.cli.board_docs_models import pages
 from jcr.errors import InputError
 from jcr.extras import DISTRIBUTION, extra
 from jcr.findings import FindingKind
-from jcr.records.capture_json import CameraEntry, CaptureFile, FrameEntry, IntrinsicsEntry
+from jcr.records.capture_schema import CameraEntry, CaptureFile, FrameEntry, IntrinsicsEntry
 from places import ROOT
 from refusal import refused
 from simulation.__main__ import Arguments as SimulationArguments

@@ -12,10 +12,10 @@ from .capture.read import read_capture as read_capture
 from .capture.ros_messages import read_ros_camera_info as read_ros_camera_info
 from .capture.ros_messages import read_ros_depth as read_ros_depth
 from .capture.ros_messages import read_ros_image as read_ros_image
-from .cell.placement import CameraPlacement as CameraPlacement
-from .cell.placement import CamerasFile as CamerasFile
-from .cell.placement import ImageUse as ImageUse
-from .cell.placement import TransformUncertainty as TransformUncertainty
+from .cell.cameras_json import CameraPlacement as CameraPlacement
+from .cell.cameras_json import CamerasFile as CamerasFile
+from .cell.cameras_json import ImageUse as ImageUse
+from .cell.cameras_json import TransformUncertainty as TransformUncertainty
 from .depth.options import DepthOptions as DepthOptions
 from .errors import InputError as InputError
 from .errors import RejectedError as RejectedError

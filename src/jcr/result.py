@@ -27,7 +27,7 @@ from jcr.calibration.record import (
 from jcr.capture.added_capture import read_added
 from jcr.capture.read import read_capture
 from jcr.cell.added_cameras import read_added_cameras
-from jcr.cell.placement import CamerasFile, read_cameras
+from jcr.cell.cameras_json import CamerasFile, read_cameras
 from jcr.depth.depth_npz import DEPTH_FILE as DEPTH
 from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions

@@ -12,7 +12,7 @@ from jcr.calibration.case import Case, Model
 from jcr.calibration.checks.images import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.robot_error_prior import errors_of
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
 from jcr.estimation.intrinsics_prior import camera_about

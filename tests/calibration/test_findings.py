@@ -12,7 +12,7 @@ from jcr.calibration.checks.images import check_remarks
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.robot_error_prior import errors_of
 from jcr.calibration.summary import summary
 from jcr.calibration.verdict import appended, judged
 from jcr.findings import Finding, FindingKind, sentence

@@ -40,10 +40,10 @@ def test_what_is_reached_is_of_a_point_seen():
     required = at_point.requirement
     assert required is not None and (required.translation_mm, required.rotation_deg) == GRASPING
     assert 300 < required.distance_mm < 1000
-    # Draws of transform and scale move the point on the optical axis by as much.
+    # Draws of the transform move the point at an exact depth on the optical axis by as much.
     steps = np.random.default_rng(0).multivariate_normal(np.zeros(7), at_point.covariance, 20_000)
     arm = 1e-3 * required.distance_mm * at_point.gripper_from_camera[:3, 2]
-    moved = steps[:, :3] + np.cross(steps[:, 3:6], arm) + steps[:, 6:] * arm
+    moved = steps[:, :3] + np.cross(steps[:, 3:6], arm)
     assert (1e3 * np.linalg.norm(moved, axis=1) < required.reached_mm).mean() == pytest.approx(0.95, abs=0.01)
     turned = np.degrees(np.linalg.norm(steps[:, 3:6], axis=1))
     assert (turned < required.reached_deg).mean() == pytest.approx(0.95, abs=0.01)

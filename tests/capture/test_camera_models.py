@@ -11,7 +11,7 @@ from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.capture.ros_messages import intrinsics_of_ros
 from jcr.export import ros
 from jcr.records import Intrinsics
-from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.capture_schema import IntrinsicsEntry
 from jcr.records.json_file import validated_content
 from refusal import refused
 

@@ -16,14 +16,14 @@ from jcr.calibration.record import Calibration
 from jcr.camera import unproject
 from jcr.capture.formats.capture_json import read, write
 from jcr.cell.added_cameras import added_camera
-from jcr.cell.place_cameras import _adopted, place_cameras
-from jcr.cell.placement import (
+from jcr.cell.cameras_json import (
     CameraPlacement,
     CamerasFile,
     TransformUncertainty,
     read_cameras,
     write_cameras,
 )
+from jcr.cell.place_cameras import _adopted, place_cameras
 from jcr.cell.rigs import CameraViews, fit_views
 from jcr.estimation.absolute_pose import CameraPose
 from jcr.estimation.hypotheses import Examined
@@ -82,7 +82,7 @@ def test_the_stated_accuracy_of_a_fixed_camera_follows_from_its_own_covariance()
     required, held_out = hand_eye.requirement, hand_eye.held_out
     assert required is not None and held_out is not None and hand_eye.intrinsics is not None
     x, distance_m = hand_eye.base_from_camera, required.distance_mm / 1e3
-    own = seen_points(x, hand_eye.uncertainty, hand_eye.intrinsics, distance_m, by_scale=False)
+    own = seen_points(x, hand_eye.uncertainty, hand_eye.intrinsics, distance_m)
     assert own.within_95_mm == pytest.approx(required.reached_mm, rel=1e-6)
     assert own.corners.within_95_mm == pytest.approx(hand_eye.uncertainty.seen.corners.within_95_mm, rel=1e-6)
     # Reported gripper poses are predicted, and not their inverses, whose positions move by the lever of a rotation.

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.robot_error_prior import errors_of
 from jcr.distributions import chi2
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import TYPICAL_RAD, camera_error_part
 from jcr.estimation.hypotheses import joint_offsets
+from jcr.estimation.outlier_rejection import robust_fit
 from jcr.estimation.pose_equations import pose_equations, reported_poses
 from jcr.estimation.problem import PoseModel, pose_problem
 from jcr.estimation.robot_noise import smooth_errors
-from jcr.estimation.robust import robust_fit
 from jcr.estimation.solve import solve
 from jcr.geometry import rotation_exp, step_between, transform
 from refusal import refused

@@ -10,7 +10,7 @@ from capture_writers import write_easy_handeye2
 from in_process import run_jcr
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration
-from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.robot_error_prior import errors_of
 from jcr.capture.read import read_source
 from jcr.estimation.prediction import predict
 from jcr.geometry import scale_translation

@@ -1,5 +1,7 @@
 """The calibration from poses: known answers, gauges of the closed form, outliers, coverage, degenerate motions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +13,9 @@ from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.estimation.closed_form import closed_form
 from jcr.estimation.pose_equations import PRIOR_STD, pose_residuals
+from jcr.estimation.problem import pose_problem
 from jcr.estimation.robot_noise import Equations, left_out, smooth_errors, solve_equations
+from jcr.estimation.solve import solve
 from jcr.findings import FindingKind
 from jcr.geometry import inverse, retract, rotation_exp, scale_translation, step_between, transform
 from refusal import refused
@@ -166,6 +170,20 @@ def test_leave_one_out_error_is_that_of_a_fit_without_the_image():
         assert np.allclose(errors[k], expected, rtol=1e-4, atol=1e-9)
         assert np.allclose(covariance[k], spread, rtol=1e-4, atol=1e-4 * np.abs(spread).max())
     assert 0.5 * 1e3 * np.sqrt(3) * NOISE[0] < full.held_out.translation_mm < 4 * 1e3 * np.sqrt(3) * NOISE[0]
+
+
+def test_the_error_of_an_unused_image_is_its_leave_one_out_error_beside_the_used_ones():
+    problem = hand_eye_problem(np.random.default_rng(10), 9, robot_noise=NOISE)
+    gripper, camera = problem.base_from_gripper, problem.recon_from_camera
+    x, scale, z = closed_form(gripper, camera)
+    poses, start = pose_problem(gripper, camera, (x, float(scale), z))
+    used = np.arange(9) != 4
+    found = solve(replace(poses, used=used), start, averaged=False)
+    every, sizes = found.poses.every, found.log_sizes
+    expected, spread = left_out(solve_equations(every, sizes), every.random(sizes))
+    errors, covariance = found.leave_one_out
+    assert np.allclose(errors[4], expected[4], rtol=1e-4, atol=1e-9)
+    assert np.allclose(covariance[4], spread[4], rtol=1e-4, atol=1e-4 * np.abs(spread[4]).max())
 
 
 UNSEEN = {

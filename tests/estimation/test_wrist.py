@@ -290,7 +290,7 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
         ]
     )
     in_camera = drawn @ x[:3, :3]
-    for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)):
+    for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M, of_map=True)):
         assert np.cov(in_camera[:, k].T) == pytest.approx(covariance, abs=0.06 * np.trace(covariance))
     # Of a depth that another sensor measured, the error of the scale is not part.
     measured = np.array(
@@ -299,9 +299,7 @@ def test_covariance_of_a_seen_point_is_that_of_draws_of_all_that_places_it():
             for step in steps
         ]
     )
-    for k, covariance in enumerate(
-        point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M, by_scale=False)
-    ):
+    for k, covariance in enumerate(point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)):
         assert np.cov((measured[:, k] @ x[:3, :3]).T) == pytest.approx(
             covariance, abs=0.06 * np.trace(covariance)
         )
@@ -323,7 +321,7 @@ def test_errors_of_the_gripper_pose_stand_beside_those_of_the_calibration():
     depth_m = DISTANCE_M * ray[:, 2] / np.linalg.norm(ray, axis=1)
     x_in_base, found = point_in_base(x, uncertainty, camera, noise, X_PX, depth_m, pose)
     assert x_in_base == pytest.approx(apply(pose, placed(x, camera)))
-    here = point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M, by_scale=False)
+    here = point_covariance(x, uncertainty, camera, X_PX, DISTANCE_M)
     on_gripper = placed(x, camera)[1]
     rng, drawn = np.random.default_rng(0), np.zeros((4000, 3))
     for metres, radians in ((noise.translation, noise.rotation), noise.systematic_left):

@@ -28,7 +28,7 @@ import jcr
 from in_process import run_jcr
 from jcr.camera import project, unproject
 from jcr.capture.images import read_image
-from jcr.cell.placement import (
+from jcr.cell.cameras_json import (
     ArmPlacement,
     CameraPlacement,
     CamerasFile,

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from chromium import Chromium
 from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.summary import summary
-from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
+from jcr.cell.cameras_json import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cli.output import VerboseOutput
 from jcr.cli.run_calibrate_batch import show
 from jcr.estimation.observability import excitation

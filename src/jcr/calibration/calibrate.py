@@ -21,7 +21,7 @@ from jcr.calibration.hand_eye import SCALE_STD, fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
 from jcr.calibration.required_accuracy import advised
-from jcr.calibration.robot_errors import RobotErrorPrior, errors_of, robot_errors
+from jcr.calibration.robot_error_prior import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.verdict import appended, judged, with_shifts, with_uncertainty
 from jcr.camera import usable_intrinsics
 from jcr.errors import InputError, RejectedError

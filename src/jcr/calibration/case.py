@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import RobotErrorPrior
+from jcr.calibration.robot_error_prior import RobotErrorPrior
 from jcr.calibration.verdict import appended, findings_of, judged
 from jcr.camera import usable_intrinsics, with_thin_prism
 from jcr.estimation.intrinsics_prior import (

@@ -10,7 +10,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import errors_of
+from jcr.calibration.robot_error_prior import errors_of
 from jcr.calibration.verdict import MIN_FOR_OUTLIERS, judged, poses_agree
 from jcr.capture.checks import far_faults
 from jcr.errors import InputError, count_of
@@ -19,10 +19,10 @@ from jcr.estimation.camera_noise import camera_error_covariance
 from jcr.estimation.closed_form import initial_estimate
 from jcr.estimation.kinematics import Arm
 from jcr.estimation.observability import observability
+from jcr.estimation.outlier_rejection import least_trimmed, robust_fit
 from jcr.estimation.pose_equations import paper_residuals, predicted_gripper_poses
 from jcr.estimation.problem import SCALE, PoseModel, Start, offset_prior, scale_prior
 from jcr.estimation.robot_noise import of_poses
-from jcr.estimation.robust import least_trimmed, robust_fit
 from jcr.estimation.solve import Solution
 from jcr.geometry import Poses, Transform, require_rigid, step_between, transform
 from jcr.least_squares import one_blas_thread

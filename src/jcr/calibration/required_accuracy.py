@@ -46,9 +46,7 @@ def advised(
     x, uncertainty = hand_eye.parent_from_camera, hand_eye.uncertainty
     if distance_m is None:
         distance_m = median_distance(gripper[hand_eye.inliers] @ x)
-    # A fixed camera has no map, so that the depth of its points is measured by another sensor.
-    has_map = hand_eye.mount == "gripper"
-    seen = seen_points(x, uncertainty, hand_eye.intrinsics, distance_m, by_scale=has_map)
+    seen = seen_points(x, uncertainty, hand_eye.intrinsics, distance_m)
     uncertainty = replace(uncertainty, seen=seen, scene=scene)
     findings = tuple(
         _as_remark(one, distance_m, 1e-3 * seen.within_95_mm)
@@ -56,9 +54,7 @@ def advised(
         if one.kind is not FindingKind.NOT_EXACT_ENOUGH
     )
     arm_known = hand_eye.joint_offsets is not None
-    required, missed = requirement_of(
-        x, uncertainty, findings, hand_eye.images_used, options, arm_known, has_map
-    )
+    required, missed = requirement_of(x, uncertainty, findings, hand_eye.images_used, options, arm_known)
     made = replace(hand_eye, uncertainty=uncertainty, requirement=required, findings=findings)
     return made.with_findings(*missed)
 
@@ -81,13 +77,12 @@ def requirement_of(
     images: int,
     options: CalibrateOptions,
     arm_known: bool = False,
-    has_map: bool = True,
 ) -> tuple[Requirement | None, tuple[Finding, ...]]:
     """Return the required and reached accuracy, and a finding if it is missed by a calibration that nothing rejects.
 
     `x` is gripper_from_camera, `uncertainty` has the uncertainty of points (`seen`), and `findings` are those of the
-    calibration. `images` is the number of used images, `arm_known` whether the arm's joints are modelled, `has_map`
-    whether depths may have the scale of a map. The first is None if no accuracy is required or it is unknown.
+    calibration. `images` is the number of used images, `arm_known` whether the arm's joints are modelled. The
+    first is None if no accuracy is required or it is unknown.
     """
     seen = uncertainty.seen
     if options.require == "none" or seen is None:
@@ -103,9 +98,7 @@ def requirement_of(
         return required, ()
     if required.met:
         return replace(required, more_images=0), ()
-    more = max(FORECAST_IMAGES - images, 0) or _more_images(
-        x, uncertainty, findings, images, required, has_map
-    )
+    more = max(FORECAST_IMAGES - images, 0) or _more_images(x, uncertainty, findings, images, required)
     required = replace(required, more_images=more)
     main_part = None if uncertainty.budget is None else uncertainty.budget.main_part
     concerns: Concerns = "images" if more is not None else "none"
@@ -121,7 +114,7 @@ def requirement_of(
         factor = 1 / (1 - 1 / np.sqrt(2 * images))
         in_mm, in_deg = factor * required.translation_mm, factor * required.rotation_deg
         eased = replace(required, translation_mm=in_mm, rotation_deg=in_deg)
-        if _more_images(x, uncertainty, findings, images, eased, has_map) is not None:
+        if _more_images(x, uncertainty, findings, images, eased) is not None:
             required, concerns = replace(required, more_images=IMAGES_FIRST), "images"
     size = 1e-3 * required.reached_mm
     return required, (
@@ -135,7 +128,6 @@ def _more_images(
     findings: Sequence[Finding],
     images: int,
     required: Requirement,
-    has_map: bool,
 ) -> int | None:
     """Return the number of images to add until a missed accuracy is reached; None above MOST_MORE_IMAGES.
 
@@ -151,7 +143,7 @@ def _more_images(
     if (budget := uncertainty.budget) is not None:
         lasting.append(budget.robot_systematic)
     of_lasting = Uncertainty(covariance=sum(lasting, start=np.zeros((7, 7))))
-    left = seen_points(x, of_lasting, None, 1e-3 * required.distance_mm, by_scale=has_map)
+    left = seen_points(x, of_lasting, None, 1e-3 * required.distance_mm)
     more = 0
     for bound, limit, least in (
         (required.reached_mm, required.translation_mm, left.within_95_mm),

@@ -17,7 +17,7 @@ from jcr.capture.options import ReadOptions
 from jcr.capture.readings import numbers_of_table, words_of
 from jcr.errors import InputError, shown
 from jcr.records import COEFFICIENTS, DistortionModel, Intrinsics
-from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.capture_schema import IntrinsicsEntry
 from jcr.records.json_file import validated_content
 
 INTRINSICS_NAMES = re.compile(

@@ -12,7 +12,7 @@ from jcr.capture.intrinsics import intrinsics_of_file
 from jcr.errors import InputError
 from jcr.files import path_inside, read_bytes, write_bytes, write_text
 from jcr.records import Capture, CellCamera
-from jcr.records.capture_json import NAME
+from jcr.records.capture_schema import NAME
 from jcr.records.json_file import read_json
 
 FOLDER, FILE = "cameras", "cameras.json"

@@ -17,12 +17,12 @@ from jcr.calibration.case import MATERIAL, Case, Model, camera_of
 from jcr.calibration.checks.effects import LARGE_MOTION, effects, straight_shift
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_error_prior import robot_errors
 from jcr.calibration.verdict import MAX_STD
 from jcr.capture.images import read_image
 from jcr.cell.board_images import located_by_board
+from jcr.cell.cameras_json import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.cell_problem import cell_images
-from jcr.cell.placement import ArmPlacement, CameraPlacement, CamerasFile, TransformUncertainty
 from jcr.cell.rigs import APART, CameraViews, Rigs, localise
 from jcr.estimation.covariance import positive_part
 from jcr.estimation.hypotheses import Examined

@@ -17,10 +17,10 @@ from jcr.calibration.checks.effects import EXAMINED_FROM, effects_of_fit
 from jcr.calibration.checks.images import SAME
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_error_prior import robot_errors
 from jcr.camera import guessed_intrinsics, usable_intrinsics
 from jcr.capture.images import read_image
-from jcr.cell.placement import CameraPlacement
+from jcr.cell.cameras_json import CameraPlacement
 from jcr.distributions import chi2
 from jcr.estimation.hypotheses import arm_effects
 from jcr.estimation.problem import Effect, PoseModel, ReportedPoses, State, scale_prior, wrist_arm

@@ -25,7 +25,7 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.cell.placement import CamerasFile
+    from jcr.cell.cameras_json import CamerasFile
 
 _CSV_COLUMNS = "x,y,z,occupancy,unknown,distance,gradient_x,gradient_y,gradient_z,red,green,blue,label,std"
 PRINTED_POINTS = 10

@@ -26,7 +26,7 @@ from jcr.scene.options import CloudOptions, MapOptions
 from jcr.segments.options import SegmentOptions
 
 if TYPE_CHECKING:
-    from jcr.cell.placement import CamerasFile
+    from jcr.cell.cameras_json import CamerasFile
     from jcr.result import RunOptions, RunResult
 
 
@@ -197,7 +197,7 @@ class AddCameraCommand:
 
     def main(self) -> int:
         """Locate the camera and print its pose in the base frame; return the exit status 0."""
-        from jcr.cell.placement import in_words
+        from jcr.cell.cameras_json import in_words
         from jcr.pipeline.run import add_camera
 
         if not self.images:

@@ -1,9 +1,9 @@
 """Uncertainty of points in gripper and base frame: pixels at a known distance, and reconstructed points.
 
 A pixel x at a distance d is the point p = d·u(K, x) in the camera, with unit ray u, and X·p in the gripper. Its error
-comes from the intrinsics K, from X and, for distances in the reconstruction, from the scale. These errors are
-correlated, since a rotation of the camera can compensate an error of the principal point, so the joint covariance is
-propagated (Kogan, mrcal, "Projection uncertainty").
+comes from the intrinsics K and from X, and for the distances of a map from its scale, too. These errors are correlated,
+since a rotation of the camera can compensate an error of the principal point, so the joint covariance is propagated
+(Kogan, mrcal, "Projection uncertainty").
 """
 
 import numpy as np
@@ -45,15 +45,15 @@ def point_covariance(
     intrinsics: Intrinsics,
     x_px: Pixels,
     distance_m: Distances,
-    by_scale: bool = True,
+    of_map: bool = False,
 ) -> Covariances:
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
     `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
-    of the distorted image, `distance_m` (...) distances (m) along the ray. `by_scale`: the distances are those of the
-    reconstruction, whose relative error is that of the scale; False: they were measured otherwise, and are exact.
+    of the distorted image, `distance_m` (...) distances (m) along the ray. They are exact, or those of the
+    calibration's own map (`of_map`), whose relative error is that of the scale.
     """
-    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m, by_scale)
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m, of_map)
     return by @ covariance @ np.swapaxes(by, -1, -2)
 
 
@@ -76,7 +76,7 @@ def point_in_base(  # noqa: PLR0913 (the parts of a calibration, a pixel and a g
     distance_m = np.asarray(depth_m) * np.linalg.norm(ray, axis=-1) / ray[..., 2]
     p_in_gripper = apply(x, np.asarray(depth_m)[..., None] * ray / ray[..., 2:])
     base_from_camera_axes = base_from_gripper[:3, :3] @ x[:3, :3]
-    in_camera = point_covariance(x, uncertainty, intrinsics, x_px, distance_m, by_scale=False)
+    in_camera = point_covariance(x, uncertainty, intrinsics, x_px, distance_m)
     lever = skew(p_in_gripper @ base_from_gripper[:3, :3].T)
     square = lever @ np.swapaxes(lever, -1, -2)
     covariance = base_from_camera_axes @ in_camera @ base_from_camera_axes.T
@@ -91,18 +91,17 @@ def bounds_at(
     intrinsics: Intrinsics,
     x_px: Float[ndarray, "2"],
     distance_m: float,
-    by_scale: bool = True,
 ) -> PointUncertainty:
     """Return 95 % bounds of the error of the point at `distance_m` (m) along the ray of the pixel `x_px`.
 
     Bounds are of the position (mm; whole, across and along the ray), the ray's direction and the rotation (degrees).
-    The error is relative to the gripper. `x` is gripper_from_camera; `uncertainty` and `by_scale` are those of
+    The error is relative to the gripper, for an exact distance. `x` is gripper_from_camera; `uncertainty` is that of
     `point_covariance`.
     """
     ray = unproject(intrinsics, x_px)
     # Rows: two axes perpendicular to the ray, then the ray.
     axes = np.linalg.svd(ray[None] / np.linalg.norm(ray))[2][[1, 2, 0]]
-    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m, by_scale)
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
     by = axes @ by
     moved = by @ covariance @ by.T
     # A translation does not change the direction. The third row becomes the rotation about the ray.
@@ -124,18 +123,17 @@ def seen_points(
     uncertainty: Uncertainty,
     camera: Intrinsics | None,
     distance_m: float,
-    by_scale: bool = True,
 ) -> PointUncertaintyOverImage:
     """Return the point uncertainty at the centre and at the worst corner of the image, at `distance_m` along the ray.
 
-    The worst corner has the largest 95 % bound of the position. `uncertainty` and `by_scale` are those of
-    `point_covariance`, `x` is gripper_from_camera. `camera` None (given camera poses): a point on the optical axis,
+    The worst corner has the largest 95 % bound of the position. `uncertainty` is that of `point_covariance`, `x` is
+    gripper_from_camera. `camera` None (given camera poses): a point on the optical axis,
     without errors of intrinsics.
     """
     camera = camera or NORMALIZED  # whose image is one pixel, on the optical axis
     right, bottom = camera.width - 1.0, camera.height - 1.0
     centre, *corners = (
-        bounds_at(x, uncertainty, camera, np.array(x_px), distance_m, by_scale)
+        bounds_at(x, uncertainty, camera, np.array(x_px), distance_m)
         for x_px in ((right / 2, bottom / 2), (0.0, 0.0), (0.0, bottom), (right, 0.0), (right, bottom))
     )
     return PointUncertaintyOverImage(**vars(centre), corners=max(corners, key=lambda one: one.within_95_mm))
@@ -251,13 +249,13 @@ def _derivatives(
     intrinsics: Intrinsics,
     x_px: Pixels,
     distance_m: Distances,
-    by_scale: bool = True,
+    of_map: bool = False,
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "j j"]]:
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns, and their covariance.
 
     The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale, the intrinsics if
     estimated, the coefficients of the distortion that the model cannot express, and the extrapolated part of the
-    distortion. `distance_m` is along the ray; the scale changes it if `by_scale`.
+    distortion. `distance_m` is along the ray; the scale changes it if `of_map`.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     ray = unproject(intrinsics, x_px)
@@ -267,7 +265,7 @@ def _derivatives(
     by_pixel = distance[..., None] * across_lines(unit)[..., :2] @ by_ray / length
     camera_from_gripper_axes = x[:3, :3].T
     by_unknown = by_similarity(distance * unit)
-    by_unknown[..., SCALE] *= by_scale
+    by_unknown[..., SCALE] *= of_map
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
     columns, covariance, by_intrinsics = [by_unknown], uncertainty.whole, by_parameters(intrinsics, ray)

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr.estimation.closed_form import closed_form
+from jcr.estimation.outlier_rejection import least_trimmed
 from jcr.estimation.pose_equations import pose_residuals
-from jcr.estimation.robust import least_trimmed
 from jcr.geometry import Poses, Transform
 
 SHARE = 0.8

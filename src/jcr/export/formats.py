@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jcr.calibration.record import UNCERTAINTY
 from jcr.calibration.summary import intrinsics_in_words
-from jcr.cell.placement import FILE as CAMERAS
+from jcr.cell.cameras_json import FILE as CAMERAS
 from jcr.errors import InputError, RejectedError, did_you_mean
 from jcr.export import ros
 from jcr.export.options import ExportName, ExportOptions, provenance
@@ -30,7 +30,7 @@ from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import MAP_FILE, load_map
 
 if TYPE_CHECKING:
-    from jcr.cell.placement import CameraPlacement
+    from jcr.cell.cameras_json import CameraPlacement
     from jcr.export.nerfstudio_colmap import PosedImages
     from jcr.records import Intrinsics, PointCloud, Pointmaps
     from jcr.scene.scene_map import SceneMap

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from jcr.calibration.calibrate import calibration_of, checked_case
 from jcr.calibration.checks.images import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_error_prior import robot_errors
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.prediction import MIN_PREDICTED_IMAGES
@@ -26,7 +26,7 @@ from jcr.live.folder import Channels, LiveFolder
 from jcr.live.progress import LiveProgress
 from jcr.options import checked_options
 from jcr.records import Capture, FrameNames, Intrinsics, Tracks
-from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.capture_schema import IntrinsicsEntry
 from jcr.sfm.live_map import LiveMap
 
 if TYPE_CHECKING:

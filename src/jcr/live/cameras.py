@@ -20,7 +20,7 @@ from numpy import ndarray
 from jcr.capture.images import BLURRED, exposure_fault, sharpness
 from jcr.errors import InputError
 from jcr.extras import extra
-from jcr.records.capture_json import IntrinsicsEntry
+from jcr.records.capture_schema import IntrinsicsEntry
 
 LOST_S = 10.0
 """Time without an image (s) after which a camera counts as lost."""

@@ -18,7 +18,7 @@ from jcr.files import IMAGES, capture_file, path_inside, remove_unfinished, writ
 from jcr.geometry import largest_motion
 from jcr.live.cameras import ImageSummary
 from jcr.records import Capture, FrameNames
-from jcr.records.capture_json import CaptureFile, FrameEntry, IntrinsicsEntry, read_rigid
+from jcr.records.capture_schema import CaptureFile, FrameEntry, IntrinsicsEntry, read_rigid
 from jcr.records.json_file import validated_content
 
 Channels = Literal["rgb", "bgr"]

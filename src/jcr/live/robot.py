@@ -22,7 +22,7 @@ from jcr.capture.notations import METRES_LIMIT, RADIANS_LIMIT, UNIT_TOLERANCE, p
 from jcr.errors import InputError
 from jcr.extras import extra
 from jcr.geometry import inverse, rotation_angle
-from jcr.records.capture_json import MOST_ROTATION, read_rigid
+from jcr.records.capture_schema import MOST_ROTATION, read_rigid
 
 REST_S = 0.5
 """Time (s) without motion after which an arm is at rest."""

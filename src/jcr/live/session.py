@@ -21,7 +21,7 @@ from jcr.errors import InputError, RejectedError, count_of
 from jcr.live.cameras import COMPARED_S, Camera, Frame, frame_at_rest
 from jcr.live.progress import LiveProgress, progress_lines, verifying_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
-from jcr.records.capture_json import FrameEntry
+from jcr.records.capture_schema import FrameEntry
 
 if TYPE_CHECKING:
     from jcr.live.calibration import LiveCalibration

@@ -13,10 +13,10 @@ from numpy import ndarray
 from jcr.calibration.checks.images import view_findings
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.required_accuracy import requirement_of
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_error_prior import robot_errors
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
-from jcr.cell.placement import CamerasFile
+from jcr.cell.cameras_json import CamerasFile
 from jcr.errors import count_of
 from jcr.estimation.observability import observability
 from jcr.estimation.prediction import MIN_PREDICTED_IMAGES, predict

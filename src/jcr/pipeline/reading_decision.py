@@ -22,8 +22,8 @@ from jcr.capture.readings import text_of, undecided
 from jcr.cell.moving_parts import with_moving_parts
 from jcr.errors import InputError, RejectedError, count_of, first_few
 from jcr.estimation.observability import observability
+from jcr.estimation.outlier_rejection import pair_angles
 from jcr.estimation.pose_misfit import MM_PER_DEG, NO_FIT, NO_ROBOT, Misfit, angle_gap, pose_misfit
-from jcr.estimation.robust import pair_angles
 from jcr.geometry import Poses, inverse, rotation_angle
 from jcr.number_format import significant
 from jcr.progress import Progress, silent

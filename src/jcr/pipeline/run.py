@@ -20,7 +20,7 @@ from jcr.capture.formats.capture_json import read as read_kept
 from jcr.capture.options import ReadOptions
 from jcr.capture.read import read_capture
 from jcr.cell.added_cameras import added_camera, keep_camera
-from jcr.cell.placement import write_cameras
+from jcr.cell.cameras_json import write_cameras
 from jcr.errors import InputError, RejectedError
 from jcr.extras import is_installed
 from jcr.files import as_path, locked, write_text

@@ -21,9 +21,9 @@ from jcr.calibration.record import AnyCalibration, Calibration, FailedCalibratio
 from jcr.calibration.summary import log
 from jcr.capture.added_capture import FOLDER as ADDED
 from jcr.capture.added_capture import write_added
+from jcr.cell.cameras_json import FILE as CAMERAS
+from jcr.cell.cameras_json import CamerasFile, write_cameras
 from jcr.cell.moving_parts import with_moving_parts
-from jcr.cell.placement import FILE as CAMERAS
-from jcr.cell.placement import CamerasFile, write_cameras
 from jcr.depth.densify import densify
 from jcr.depth.depth_npz import FORMAT as DEPTH_FORMAT
 from jcr.depth.depth_npz import write_depth

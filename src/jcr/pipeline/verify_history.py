@@ -20,7 +20,7 @@ from jcr.calibration.drift import (
     most_telling,
     step_of,
 )
-from jcr.calibration.robot_errors import robot_errors
+from jcr.calibration.robot_error_prior import robot_errors
 from jcr.errors import InputError, first_fault
 from jcr.estimation.absolute_pose import absolute_pose
 from jcr.estimation.robot_noise import of_poses

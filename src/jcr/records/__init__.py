@@ -5,6 +5,6 @@ and unit). Pixel (0, 0) is the *centre* of the top-left pixel, as in OpenCV. Met
 """
 
 from jcr.findings.finding import Requirement as Requirement
-from jcr.records.calibration import *
+from jcr.records.calibration_parts import *
 from jcr.records.capture import *
 from jcr.records.reconstruction import *

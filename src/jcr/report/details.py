@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from jcr.calibration.record import AnyCalibration
 from jcr.calibration.summary import facts
-from jcr.cell.placement import CamerasFile, TransformUncertainty
+from jcr.cell.cameras_json import CamerasFile, TransformUncertainty
 from jcr.extras import is_installed
 from jcr.number_format import decimals_of, significant
 from jcr.report.render import Content, label_colors

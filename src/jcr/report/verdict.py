@@ -10,7 +10,7 @@ from jcr.calibration.summary import (
     leave_one_out_text,
     worst_direction,
 )
-from jcr.cell.placement import CamerasFile
+from jcr.cell.cameras_json import CamerasFile
 from jcr.findings import FindingKind, reached_in_words, sentence
 from jcr.number_format import significant
 from jcr.report.render import Content

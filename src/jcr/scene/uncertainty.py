@@ -73,7 +73,9 @@ def map_uncertainty(scene: "SceneMap", cloud: PointCloud, hand_eye: Calibration)
     reach = np.linalg.norm(cloud.points_in_base - cloud.camera_centers_in_base[cloud.image], axis=1)
     camera, distance = hand_eye.intrinsics or NORMALIZED, float(np.median(reach))
     middle_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
-    seen = point_covariance(hand_eye.gripper_from_camera, uncertainty, camera, middle_px, distance)
+    seen = point_covariance(
+        hand_eye.gripper_from_camera, uncertainty, camera, middle_px, distance, of_map=True
+    )
     # A rotation moves a point across the lever alone, that is along two of three axes.
     look = np.trace(seen) / 3 + noise[0] ** 2 + 2 / 3 * (noise[1] * distance) ** 2
     margin = 0.0 if cloud.margin is None else float(np.sqrt((cloud.margin**2).mean()))

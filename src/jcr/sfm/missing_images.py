@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from jcr.camera import HALF_PIXEL
-from jcr.estimation.robust import least_trimmed, robust_fit
+from jcr.estimation.outlier_rejection import least_trimmed, robust_fit
 from jcr.features.matchers import Matcher
 from jcr.geometry import Transform, inverse
 from jcr.sfm.model import adjust_robustly, poses_of, rows_of, triangulated_model

@@ -15,8 +15,8 @@ from jcr.capture.notations import EULERS, NUMBERS, in_words, rotations_of
 from jcr.capture.notations import numbers_of as written_in
 from jcr.capture.pairing import AS_NUMBERS, AS_TEXT, other_orders
 from jcr.capture.readings import options_of, text_of
+from jcr.estimation.outlier_rejection import pair_angles
 from jcr.estimation.pose_misfit import NO_ROBOT, Misfit, angle_gap, pose_misfit
-from jcr.estimation.robust import pair_angles
 from jcr.findings import Finding, FindingKind
 from jcr.geometry import Poses, Transform, inverse, rotation_angle, transform
 from jcr.records import Reading

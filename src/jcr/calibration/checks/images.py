@@ -11,8 +11,8 @@ from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image, show_one_view
 from jcr.estimation.closed_form import initial_estimate
+from jcr.estimation.outlier_rejection import least_trimmed
 from jcr.estimation.pose_equations import predicted_gripper_poses
-from jcr.estimation.robust import least_trimmed
 from jcr.features.sift import SIFT_DISTANCE, detect, grey_of
 from jcr.findings import Finding, FindingKind, verdict_of
 from jcr.geometry import inverse, largest_motion, scale_translation, step_between

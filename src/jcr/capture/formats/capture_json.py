@@ -15,7 +15,7 @@ from jcr.errors import InputError, count_of, did_you_mean, shown
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.files import capture_file, path_inside, read_bytes, write_new
 from jcr.records import Capture, CellCamera
-from jcr.records.capture_json import (
+from jcr.records.capture_schema import (
     CameraEntries,
     CameraEntry,
     CaptureFile,
