@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.calibration.bundle_adjustment import adjusted
 from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.case import Case, Model
 from jcr.calibration.checks.images import REPETITIVE, share_of_twins
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_error_prior import errors_of
 from jcr.camera import parameters, with_parameters
 from jcr.capture.images import read_image
 from jcr.estimation.intrinsics_prior import camera_about

@@ -10,11 +10,11 @@ import pytest
 
 import benchmarks.faults
 from benchmarks.faults import outcome
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.calibration.bundle_adjustment import adjusted
 from jcr.calibration.calibrate import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
 from jcr.calibration.checks.effects import _is_plausible, as_remark, check_effects, examined_case
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.robot_error_prior import errors_of
 from jcr.estimation import hypotheses
 from jcr.estimation.arms import arm_named
 from jcr.estimation.hypotheses import camera_effects

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.calibration.calibrate import calibrate_pose_pairs, calibrate_reconstruction, fitted_case
 from jcr.calibration.checks.images import check_remarks
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, read_calibration
-from jcr.calibration.robot_error_prior import errors_of
 from jcr.calibration.summary import summary
 from jcr.calibration.verdict import appended, judged
 from jcr.findings import Finding, FindingKind, sentence

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.calibration.hand_eye import solve_hand_eye
-from jcr.calibration.robot_error_prior import errors_of
 from jcr.distributions import chi2
 from jcr.estimation.arms import arm_named
 from jcr.estimation.camera_noise import TYPICAL_RAD, camera_error_part

@@ -8,9 +8,9 @@ import numpy as np
 
 from capture_writers import write_easy_handeye2
 from in_process import run_jcr
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.record import read_calibration
-from jcr.calibration.robot_error_prior import errors_of
 from jcr.capture.read import read_source
 from jcr.estimation.prediction import predict
 from jcr.geometry import scale_translation

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jcr.calibration.robot_error_prior import errors_of
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.capture.urdf_chain import read_chain
 from jcr.estimation.arms import ROBOT_NAMES, arm_named
 from jcr.estimation.inverse_kinematics import LengthError, inverse_kinematics, mounted_arm

@@ -18,8 +18,9 @@ import jcr
 from in_process import run_jcr
 from jcr.capture.images import read_image
 from jcr.live import robot
-from jcr.live.cameras import Frame, ImageSummary, frame_at_rest, open_camera
+from jcr.live.cameras import Frame, open_camera
 from jcr.live.folder import LiveFolder
+from jcr.live.kept_frames import ImageSummary, frame_at_rest
 from jcr.live.robot import MOVED_ON, RobotState, next_rest
 from jcr.live.session import Answer, LiveSession, SessionOptions
 from refusal import refused

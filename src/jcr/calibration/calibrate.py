@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from jcr.calibration.arm_of_capture import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.bundle_adjustment import adjusted
 from jcr.calibration.case import Case, Model, camera_of
 from jcr.calibration.checks.boards import check_board_shapes, check_boards
@@ -21,7 +22,6 @@ from jcr.calibration.hand_eye import SCALE_STD, fit_poses, solve_hand_eye
 from jcr.calibration.options import CalibrateOptions, check_options
 from jcr.calibration.record import Calibration
 from jcr.calibration.required_accuracy import advised
-from jcr.calibration.robot_error_prior import RobotErrorPrior, errors_of, robot_errors
 from jcr.calibration.verdict import appended, judged, with_shifts, with_uncertainty
 from jcr.camera import usable_intrinsics
 from jcr.errors import InputError, RejectedError

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from jcr.calibration.arm_of_capture import RobotErrorPrior
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_error_prior import RobotErrorPrior
 from jcr.calibration.verdict import appended, findings_of, judged
 from jcr.camera import usable_intrinsics, with_thin_prism
 from jcr.estimation.intrinsics_prior import (

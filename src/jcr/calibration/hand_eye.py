@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from jcr.calibration.arm_of_capture import errors_of
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_error_prior import errors_of
 from jcr.calibration.verdict import MIN_FOR_OUTLIERS, judged, poses_agree
 from jcr.capture.checks import far_faults
 from jcr.errors import InputError, count_of

@@ -13,11 +13,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from jcr import __version__
+from jcr.calibration.arm_of_capture import robot_errors
 from jcr.calibration.case import MATERIAL, Case, Model, camera_of
 from jcr.calibration.checks.effects import LARGE_MOTION, effects, straight_shift
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_error_prior import robot_errors
 from jcr.calibration.verdict import MAX_STD
 from jcr.capture.images import read_image
 from jcr.cell.board_images import located_by_board

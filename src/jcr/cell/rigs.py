@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
+from jcr.calibration.arm_of_capture import robot_errors
 from jcr.calibration.case import MIN_IMAGES, Case
 from jcr.calibration.checks.effects import EXAMINED_FROM, effects_of_fit
 from jcr.calibration.checks.images import SAME
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.record import Calibration
-from jcr.calibration.robot_error_prior import robot_errors
 from jcr.camera import guessed_intrinsics, usable_intrinsics
 from jcr.capture.images import read_image
 from jcr.cell.cameras_json import CameraPlacement

@@ -12,10 +12,10 @@ from jaxtyping import UInt16
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from jcr.calibration.arm_of_capture import robot_errors
 from jcr.calibration.calibrate import calibration_of, checked_case
 from jcr.calibration.checks.images import SAME
 from jcr.calibration.options import CalibrateOptions, check_options
-from jcr.calibration.robot_error_prior import robot_errors
 from jcr.capture.images import BLURRED_EDGE, EDGES_AT, edge_width, read_image
 from jcr.errors import InputError, RejectedError
 from jcr.estimation.prediction import MIN_PREDICTED_IMAGES

@@ -16,7 +16,7 @@ from jcr.capture.images import encode_png, read_image, size_of_all
 from jcr.errors import InputError, other_size
 from jcr.files import IMAGES, capture_file, path_inside, remove_unfinished, write_bytes, write_text
 from jcr.geometry import largest_motion
-from jcr.live.cameras import ImageSummary
+from jcr.live.kept_frames import ImageSummary
 from jcr.records import Capture, FrameNames
 from jcr.records.capture_schema import CaptureFile, FrameEntry, IntrinsicsEntry, read_rigid
 from jcr.records.json_file import validated_content

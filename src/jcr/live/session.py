@@ -18,7 +18,8 @@ from numpy import ndarray
 from jcr.calibration.options import GRASPING, RequiredAccuracy
 from jcr.capture.options import MIN_FRAMES
 from jcr.errors import InputError, RejectedError, count_of
-from jcr.live.cameras import COMPARED_S, Camera, Frame, frame_at_rest
+from jcr.live.cameras import Camera, Frame
+from jcr.live.kept_frames import COMPARED_S, frame_at_rest
 from jcr.live.progress import LiveProgress, progress_lines, verifying_lines
 from jcr.live.robot import MOVED_ON, REST, TRY_AGAIN, Action, RobotState, States, is_farther, next_rest
 from jcr.records.capture_schema import FrameEntry

@@ -7,11 +7,11 @@ from functools import cache
 from typing import Any
 
 from jcr.backends import BACKENDS, MARKER, ReconstructOptions, reconstruct, tries
+from jcr.calibration.arm_of_capture import robot_errors
 from jcr.calibration.calibrate import calibrate_reconstruction
 from jcr.calibration.checks.images import as_causes, view_findings
 from jcr.calibration.options import CalibrateOptions
 from jcr.calibration.record import Calibration, PublishedCalibration
-from jcr.calibration.robot_error_prior import robot_errors
 from jcr.calibration.summary import leave_one_out_text
 from jcr.errors import InputError, RejectedError
 from jcr.extras import extra

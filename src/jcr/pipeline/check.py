@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from jcr.calibration.arm_of_capture import robot_errors
 from jcr.calibration.checks.images import view_findings
 from jcr.calibration.record import AnyCalibration, Calibration
 from jcr.calibration.required_accuracy import requirement_of
-from jcr.calibration.robot_error_prior import robot_errors
 from jcr.capture.images import exposure_fault, read_image
 from jcr.capture.read import read_source
 from jcr.cell.cameras_json import CamerasFile

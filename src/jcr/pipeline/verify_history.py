@@ -10,6 +10,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from pydantic import Field, ValidationError
 
+from jcr.calibration.arm_of_capture import robot_errors
 from jcr.calibration.drift import (
     MOST_OLD,
     Change,
@@ -20,7 +21,6 @@ from jcr.calibration.drift import (
     most_telling,
     step_of,
 )
-from jcr.calibration.robot_error_prior import robot_errors
 from jcr.errors import InputError, first_fault
 from jcr.estimation.absolute_pose import absolute_pose
 from jcr.estimation.robot_noise import of_poses

@@ -1,4 +1,4 @@
-"""Prior covariance of systematic gripper pose errors: joint and link errors of a known arm, or smooth errors."""
+"""The arm of a capture, and the prior covariance of its systematic errors: joint and link errors, or smooth ones."""
 
 from dataclasses import dataclass, replace
 
