@@ -1,9 +1,9 @@
 """Uncertainty of points in gripper and base frame: pixels at a known distance, and reconstructed points.
 
 A pixel x at a distance d is the point p = d·u(K, x) in the camera, with unit ray u, and X·p in the gripper. Its error
-comes from the intrinsics K and from X, and for the distances of a map from its scale, too. These errors are correlated,
-since a rotation of the camera can compensate an error of the principal point, so the joint covariance is propagated
-(Kogan, mrcal, "Projection uncertainty").
+comes from the intrinsics K and from X; the distance is exact. These errors are correlated, since a rotation of the
+camera can compensate an error of the principal point, so the joint covariance is propagated (Kogan, mrcal, "Projection
+uncertainty").
 """
 
 import numpy as np
@@ -45,15 +45,13 @@ def point_covariance(
     intrinsics: Intrinsics,
     x_px: Pixels,
     distance_m: Distances,
-    of_map: bool = False,
 ) -> Covariances:
     """Return the covariance (m², in camera axes) of points relative to the gripper, without errors of gripper poses.
 
     `x` is gripper_from_camera; `uncertainty` is the joint one of `x`, scale and `intrinsics`. `x_px` (...,2) are pixels
-    of the distorted image, `distance_m` (...) distances (m) along the ray. They are exact, or those of the
-    calibration's own map (`of_map`), whose relative error is that of the scale.
+    of the distorted image, `distance_m` (...) exact distances (m) along the ray.
     """
-    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m, of_map)
+    by, covariance = _derivatives(x, uncertainty, intrinsics, x_px, distance_m)
     return by @ covariance @ np.swapaxes(by, -1, -2)
 
 
@@ -249,13 +247,12 @@ def _derivatives(
     intrinsics: Intrinsics,
     x_px: Pixels,
     distance_m: Distances,
-    of_map: bool = False,
 ) -> tuple[Float[ndarray, "*points 3 j"], Float[ndarray, "j j"]]:
     """Return derivatives of points relative to the gripper, in camera axes, by j unknowns, and their covariance.
 
     The unknowns are gripper_from_camera `x` (translation, rotation; gripper axes), log scale, the intrinsics if
     estimated, the coefficients of the distortion that the model cannot express, and the extrapolated part of the
-    distortion. `distance_m` is along the ray; the scale changes it if `of_map`.
+    distortion. `distance_m` is along the ray, and the scale does not change it.
     """
     x_px, left = np.asarray(x_px, float), uncertainty.model_error
     ray = unproject(intrinsics, x_px)
@@ -265,7 +262,7 @@ def _derivatives(
     by_pixel = distance[..., None] * across_lines(unit)[..., :2] @ by_ray / length
     camera_from_gripper_axes = x[:3, :3].T
     by_unknown = by_similarity(distance * unit)
-    by_unknown[..., SCALE] *= of_map
+    by_unknown[..., SCALE] = 0.0
     by_unknown[..., :3] = camera_from_gripper_axes
     by_unknown[..., 3:6] = by_unknown[..., 3:6] @ camera_from_gripper_axes
     columns, covariance, by_intrinsics = [by_unknown], uncertainty.whole, by_parameters(intrinsics, ray)

@@ -38,8 +38,9 @@ class MapUncertainty:
     shape_m: Spread
     """Standard deviation per axis of a point's remaining error by the calibration (m)."""
     look_std_m: Spread
-    """Standard deviation per axis (m) of a point that the robot locates by an image from another pose: by transform,
-    intrinsics and the error of that gripper pose. It changes with the pose, and is no part of the map's errors."""
+    """Standard deviation per axis (m) of a point that the robot locates by pixel and exact depth in another image: by
+    transform, intrinsics and the error of that gripper pose. It changes with the pose, and is no part of the map's
+    errors."""
     lower: Float[ndarray, "3"]
     """Lower corner (m) of the first block; the sides of a block are `block_m`."""
     block_m: Positive
@@ -73,9 +74,7 @@ def map_uncertainty(scene: "SceneMap", cloud: PointCloud, hand_eye: Calibration)
     reach = np.linalg.norm(cloud.points_in_base - cloud.camera_centers_in_base[cloud.image], axis=1)
     camera, distance = hand_eye.intrinsics or NORMALIZED, float(np.median(reach))
     middle_px = np.array([camera.width - 1.0, camera.height - 1.0]) / 2
-    seen = point_covariance(
-        hand_eye.gripper_from_camera, uncertainty, camera, middle_px, distance, of_map=True
-    )
+    seen = point_covariance(hand_eye.gripper_from_camera, uncertainty, camera, middle_px, distance)
     # A rotation moves a point across the lever alone, that is along two of three axes.
     look = np.trace(seen) / 3 + noise[0] ** 2 + 2 / 3 * (noise[1] * distance) ** 2
     margin = 0.0 if cloud.margin is None else float(np.sqrt((cloud.margin**2).mean()))
