@@ -150,7 +150,7 @@ def with_fault(what: str, focal: float, given: bool, faults: Faults, is_shuffled
         for a, ray in ((found.gripper_from_camera, seen), (mounts[0], true))
     ]
     covariance = point_covariance(
-        found.gripper_from_camera, found.uncertainty, found.reconstruction.intrinsics, np.zeros(2), 0.6
+        found.gripper_from_camera, found.found.uncertainty, found.reconstruction.intrinsics, np.zeros(2), 0.6
     )
     within = 1e3 * np.sqrt(chi2.ppf(0.95, 3) * np.linalg.eigvalsh(covariance)[-1])
     names_found = (

@@ -5,12 +5,12 @@ A file of the run folder may be invalid, because the user has edited it; reading
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -33,7 +33,8 @@ from jcr.depth.depth_npz import read_depth
 from jcr.depth.options import DepthOptions
 from jcr.errors import InputError, RejectedError, first_fault
 from jcr.files import as_path, read_bytes
-from jcr.records import Attempt, Capture, CellCamera, PointCloud, Reconstruction
+from jcr.findings import Finding, Verdict
+from jcr.records import Attempt, Capture, CellCamera, IntrinsicsAndStd, PointCloud, Reconstruction
 from jcr.records.reconstruction_npz import read_reconstruction
 from jcr.scene.cloud import read_cloud
 from jcr.scene.map_file import MAP_FILE as MAP
@@ -91,9 +92,9 @@ class RunState(BaseModel):
 
 
 class RunResult:
-    """Result of a run in the folder `out`; it also has all attributes of its `calibration`.
+    """Result of a run in the folder `out`: its records, and the numbers that most programs need.
 
-    `help(jcr.Calibration)` describes these: verdict, gripper_from_camera, covariance, intrinsics, images, findings, ….
+    All other numbers are those of its `calibration`; `help(jcr.Calibration)` describes them.
 
     Parts that this process has not computed are read from the folder on first use; a damaged file raises InputError.
     """
@@ -111,15 +112,6 @@ class RunResult:
         """Return the result with the properties named in `parts`, such as `calibration`, replaced."""
         return RunResult(**(vars(self) | parts))
 
-    def __getattr__(self, name: str) -> Any:
-        """Return the attribute `name` of the calibration, for names that the result does not have itself."""
-        if name.startswith("_"):
-            raise AttributeError(name)
-        return getattr(self.calibration, name)
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *dir(Calibration), *(field.name for field in fields(Calibration))})
-
     def __repr__(self) -> str:
         try:
             found = self.calibration
@@ -131,6 +123,50 @@ class RunResult:
     def calibration(self) -> AnyCalibration:
         """Calibration of the run, which is the content of calibration.json; also that of a failed one."""
         return read_calibration(self.out)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Result of all checks: accepted; accepted, but not as exact as needed; not checked; or rejected."""
+        return self.calibration.verdict
+
+    @property
+    def converged(self) -> bool:
+        """Whether no finding rejects the calibration, which may be less exact than needed."""
+        return self.calibration.converged
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings of the checks: first those that reject, then warnings, then remarks; causes before consequences."""
+        return self.calibration.findings
+
+    @property
+    def gripper_from_camera(self) -> Float[ndarray, "4 4"]:
+        """Pose (m) of a camera on the gripper; raises InputError for a fixed one, RejectedError without calibration."""
+        return self.solved.gripper_from_camera
+
+    @property
+    def base_from_camera(self) -> Float[ndarray, "4 4"]:
+        """Pose (m) of a fixed camera; raises InputError for one on the gripper, RejectedError without calibration."""
+        return self.solved.base_from_camera
+
+    @property
+    def covariance(self) -> Float[ndarray, "7 7"]:
+        """Covariance of transform and log scale, as `Calibration.covariance`; the errors are those of `found`."""
+        return self.found.covariance
+
+    @property
+    def intrinsics(self) -> IntrinsicsAndStd | None:
+        """Intrinsics to use together with the transform (px); None for a calibration from given poses."""
+        return self.calibration.intrinsics
+
+    def point_in_base(
+        self, pixel: ArrayLike, depth_m: ArrayLike | float, base_from_gripper: ArrayLike
+    ) -> tuple[Float[ndarray, "*points 3"], Float[ndarray, "*points 3 3"]]:
+        """Return base-frame coordinates (m) and covariances (m²) of points, as `Calibration.point_in_base`.
+
+        Raises also the errors of `found`.
+        """
+        return self.found.point_in_base(pixel, depth_m, base_from_gripper)
 
     @property
     def found(self) -> Calibration:

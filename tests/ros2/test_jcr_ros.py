@@ -133,7 +133,8 @@ def test_a_rejected_transform_is_not_broadcast(tmp_path: Path):
     broadcast: list[ndarray] = []
     nothing: Any = lambda *_: None  # noqa: E731
     calibrator = Calibrator(Settings(folder=tmp_path / "c"), lambda: None, nothing, nothing, broadcast.append)
-    found = {"gripper_from_camera": np.eye(4), "covariance": np.eye(7), "warnings": ["the camera moved"]}
+    said = SimpleNamespace(warnings=["the camera moved"])
+    found = {"gripper_from_camera": np.eye(4), "covariance": np.eye(7), "calibration": said}
     for converged, verdict in ((False, "rejected"), (True, "accepted")):
         result = SimpleNamespace(**found, converged=converged, verdict=verdict)
         calibrator._conclude(SimpleNamespace(finish=lambda result=result: result))  # type: ignore[arg-type]

@@ -240,7 +240,8 @@ class Calibrator:
             f"{np.degrees(std[3:6].max()):.2g} deg; {result.verdict}"
         )
         is_accepted = result.verdict == "accepted"
-        self.outcome = is_accepted, line + ("" if is_accepted else f": {'; '.join(result.warnings)}")
+        why = "" if is_accepted else f": {'; '.join(result.calibration.warnings)}"
+        self.outcome = is_accepted, line + why
         if is_accepted:
             self.broadcast(x)
 

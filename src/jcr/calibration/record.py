@@ -110,7 +110,9 @@ AnyOutcome = TypeVar("AnyOutcome", bound="Outcome")
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Outcome:
-    """Base class of Calibration and FailedCalibration: findings, verdict, and the use of each image.
+    """Base class of Calibration, FailedCalibration and PublishedCalibration, with the fields of calibration.json.
+
+    Each class states which of the fields that may be None here are always set.
 
     With mount "gripper" the camera is on the gripper, and the reconstructed scene rests in the base frame. With mount
     "base" the camera is fixed, and the gripper carries the reconstructed object. `parent_from_camera` is
@@ -140,6 +142,27 @@ class Outcome:
     intrinsics_source: Literal["given", "estimated"] | None = None
     """Source of `intrinsics`: given, or adjusted from given ones; or estimated, also where given ones did not fit the
     images. None: not recorded."""
+    scale: Positive | None = None
+    """Metres per unit of the reconstruction."""
+    uncertainty: Uncertainty | None = None
+    """Uncertainty of transform and scale, along axes of the gripper, or of the base for a fixed camera."""
+    source: Literal["images", "poses"] | None = None
+    """images: result of a bundle adjustment with the gripper poses; poses: result of a fit to camera poses."""
+    residuals: PaperResiduals | None = None
+    """Residuals δ_t and δ_R of the paper (eq. 16); small ones do not prove accuracy."""
+    robot_noise: RobotNoise | None = None
+    joint_offsets: JointOffsets | None = None
+    """Estimated joint offsets; None where the arm is not known."""
+    held_out: LeaveOneOut | None = None
+    """Leave-one-out error; None where too few images are used."""
+    requirement: Requirement | None = None
+    """Required and reached accuracy; None if none is required, and for the result of `solve_hand_eye`."""
+    with_given_intrinsics: GivenIntrinsicsResult | None = None
+    """Transform to use with the given intrinsics; None if none were given, or if the images were not adjusted."""
+    depth_check: DepthCheck | None = None
+    """Scale and noise of the depth images; None without them, or if too few features have a depth."""
+    lengths: tuple[LengthCheck, ...] = ()
+    """Known lengths, each compared with the robot's positions."""
     findings: tuple[FindingJson, ...] = ()
     """Findings of the checks: first those that reject, then warnings, then remarks; causes before consequences."""
     frame_names: FrameNames = FrameNames()
@@ -175,6 +198,24 @@ class Outcome:
     def observability(self) -> Observability:
         """Directions of translation, rotation and scale that the motions leave unobservable."""
         return Observability(tuple(one for one in self.findings if one.kind is FindingKind.UNOBSERVABLE))
+
+    @computed_field
+    @property
+    def robot_errors(self) -> dict[str, Any] | None:
+        """Systematic robot errors as JSON: `systematic_deg`, `translation_mm` and `rotation_deg`, and `joints`.
+
+        `systematic_deg` is their size (`RobotNoise.systematic`); `translation_mm` and `rotation_deg` are the part per
+        axis that the fit leaves. `joints` lists the offset and standard deviation of each joint (degrees); null for an
+        unknown arm. None where the errors are unknown.
+        """
+        if self.robot_noise is None:
+            return None
+        offsets, joints = self.joint_offsets, None
+        if offsets is not None:
+            degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
+            joints = [{"offset_deg": offset, "std_deg": std} for offset, std in degrees]
+        systematic, left = rounded(np.degrees(self.robot_noise.systematic)), self.robot_noise.systematic_left
+        return {"systematic_deg": systematic, **mm_and_deg(*left), "joints": joints}
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"] | None:
@@ -257,26 +298,11 @@ class Outcome:
 class Calibration(Outcome):
     """Result of a hand-eye calibration: transform, scale, uncertainty, robot errors, and accuracy; see also Outcome."""
 
-    scale: Positive
-    """Metres per unit of the reconstruction."""
-    uncertainty: Uncertainty
-    """Uncertainty of transform and scale, along axes of the gripper, or of the base for a fixed camera."""
+    scale: Positive = field()
+    uncertainty: Uncertainty = field()
     source: Literal["images", "poses"] = "poses"
-    """images: result of a bundle adjustment with the gripper poses; poses: result of a fit to camera poses."""
     residuals: PaperResiduals = PaperResiduals(0.0, 0.0)
-    robot_noise: RobotNoise
-    joint_offsets: JointOffsets | None = None
-    """Estimated joint offsets; None where the arm is not known."""
-    held_out: LeaveOneOut | None = None
-    """Leave-one-out error; None where too few images are used."""
-    requirement: Requirement | None = None
-    """Required and reached accuracy; None if none is required, and for the result of `solve_hand_eye`."""
-    with_given_intrinsics: GivenIntrinsicsResult | None = None
-    """Transform to use with the given intrinsics; None if none were given, or if the images were not adjusted."""
-    depth_check: DepthCheck | None = None
-    """Scale and noise of the depth images; None without them, or if too few features have a depth."""
-    lengths: tuple[LengthCheck, ...] = ()
-    """Known lengths, each compared with the robot's positions."""
+    robot_noise: RobotNoise = field()
 
     def __post_init__(self) -> None:
         """Raise InputError unless the scale is possible and exactly the two transforms of the mount are set."""
@@ -285,22 +311,6 @@ class Calibration(Outcome):
         own, other = (own, other) if self.mount == "gripper" else (other, own)
         if any(one is None for one in own) or any(one is not None for one in other):
             raise InputError(f"the transforms are not those of the mount {self.mount}")
-
-    @computed_field
-    @property
-    def robot_errors(self) -> dict[str, Any]:
-        """Systematic robot errors as JSON: `systematic_deg`, `translation_mm` and `rotation_deg`, and `joints`.
-
-        `systematic_deg` is their size (`RobotNoise.systematic`); `translation_mm` and `rotation_deg` are the part per
-        axis that the fit leaves. `joints` lists the offset and standard deviation of each joint (degrees); null for an
-        unknown arm.
-        """
-        offsets, joints = self.joint_offsets, None
-        if offsets is not None:
-            degrees = np.degrees([offsets.offset, offsets.std]).T.tolist()
-            joints = [{"offset_deg": offset, "std_deg": std} for offset, std in degrees]
-        systematic, left = rounded(np.degrees(self.robot_noise.systematic)), self.robot_noise.systematic_left
-        return {"systematic_deg": systematic, **mm_and_deg(*left), "joints": joints}
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -414,37 +424,11 @@ class Calibration(Outcome):
             )
 
 
-class _WithoutUncertainty(Outcome):
-    """Base class of the records that lack fields of a Calibration: these fields are None, and null in the file."""
-
-    def __getattr__(self, name: str) -> Any:
-        """Return None or () for a field that only a Calibration has; raise RejectedError for its methods.
-
-        Raises AttributeError for a name that a Calibration does not have.
-        """
-        if name in Calibration.__dataclass_fields__ or name == "robot_errors":
-            return () if name == "lengths" else None
-        if name.startswith("_") or not hasattr(Calibration, name):
-            raise AttributeError(name)
-        raise RejectedError(self._lacking())
-
-    def _lacking(self) -> str:
-        """Return the reason why the record lacks fields of a Calibration."""
-        return f"no calibration was found: {self.doubt}"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the content of calibration.json: the keys of a Calibration, null or empty where this has no value."""
-        fields = {*Calibration.__dataclass_fields__, "robot_errors"} - self.__dataclass_fields__.keys()
-        empty = {name: [] if name == "lengths" else None for name in sorted(fields)}
-        return super().as_json() | empty
-
-
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class FailedCalibration(_WithoutUncertainty):
+class FailedCalibration(Outcome):
     """Result for a capture that could not be reconstructed; its findings are the reasons.
 
-    Fields of a Calibration, such as `scale`, are None here and null in the file. Properties and methods of a
-    Calibration raise RejectedError.
+    Fields that only a calibration has, such as `scale`, are None here and null in the file.
     """
 
     @computed_field
@@ -457,16 +441,14 @@ class FailedCalibration(_WithoutUncertainty):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class PublishedCalibration(_WithoutUncertainty):
+class PublishedCalibration(Outcome):
     """Result of the published method: transform, scale and residuals, without covariance and without checks.
 
     Other fields of a Calibration, such as `uncertainty`, are None here and null in the file.
     """
 
-    scale: Positive
-    """Metres per unit of the reconstruction."""
-    residuals: PaperResiduals
-    """Residuals δ_t and δ_R of the paper (eq. 16); small ones do not prove accuracy."""
+    scale: Positive = field()
+    residuals: PaperResiduals = field()
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -477,9 +459,6 @@ class PublishedCalibration(_WithoutUncertainty):
     def base_from_recon(self) -> Similarity:
         """Similarity from recon coordinates (any unit) to the base frame (m)."""
         return Similarity(self._require(self.resting, "gripper"), self.scale)
-
-    def _lacking(self) -> str:
-        return "the published method states no uncertainty; run the default method for this"
 
 
 AnyCalibration = Calibration | FailedCalibration | PublishedCalibration

@@ -74,7 +74,7 @@ class MapCommand:
         if len(result.added):
             lines.append(f"added: {count_of(len(result.added), 'image')} in this and earlier commands")
         self.output.result(lines, files)
-        if (doubt := result.doubt) is not None:
+        if (doubt := result.calibration.doubt) is not None:
             raise RejectedError(f"map rejected: {doubt}")
         return 0
 
@@ -213,7 +213,7 @@ class QueryCommand:
         few = islice(zip(x_in_base, *values, labels, strict=True), PRINTED_POINTS)
         lines = [summary, *(_answer(*one) for one in few)]
         self.output.result(lines, answers)
-        if (doubt := load_run(self.out).doubt) is not None:
+        if (doubt := load_run(self.out).calibration.doubt) is not None:
             raise RejectedError(f"answers rejected: {doubt}")
         return 0
 
@@ -314,7 +314,7 @@ class MeasureCommand:
         # Metres, base frame, one sigma; `on_plane` is left out because it has a value for each point of the cloud.
         plane = {name: value for name, value in vars(support).items() if name != "on_plane"}
         self.output.result(lines, {"support": plane, "objects": [vars(size) for size in objects]})
-        if (doubt := load_run(self.out).doubt) is not None:
+        if (doubt := load_run(self.out).calibration.doubt) is not None:
             raise RejectedError(f"sizes rejected: {doubt}")
         return 0
 

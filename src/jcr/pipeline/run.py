@@ -14,6 +14,7 @@ import numpy as np
 from jcr.backends import BackendName, ReconstructOptions, device_of
 from jcr.calibration.calibrate import calibrate_pose_pairs
 from jcr.calibration.options import CalibrateOptions, check_options
+from jcr.calibration.record import FailedCalibration
 from jcr.capture.added_capture import with_added_images
 from jcr.capture.formats.capture_json import kept, origin
 from jcr.capture.formats.capture_json import read as read_kept
@@ -90,8 +91,8 @@ def run(
             keep_reconstruction(result, alone)
         if is_unchanged(result):
             before = RunResult(out, capture=result.capture, is_unchanged=True)
-            if before.parent_from_camera is None:
-                raise NothingFoundError(RejectedError(before.doubt))
+            if isinstance(failed := before.calibration, FailedCalibration):
+                raise NothingFoundError(RejectedError(str(failed.doubt)))
             return before
         if options.map is not None:
             # Torch and the compiled loops of depth take over a second each to load; COLMAP leaves a core free for them.
