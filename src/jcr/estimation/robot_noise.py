@@ -32,7 +32,9 @@ from jcr.records import RobotNoise
 REACH = 0.45
 """Typical lever (m) between an arm's joint and its gripper, which turns an angle error into a position error."""
 ALIKE = 1.0
-"""Distance of gripper poses (chord 2 sin(θ/2) of the angle θ; lengths over REACH) with the correlation e^(−1/2)."""
+"""Distance of gripper poses (chord 2 sin(θ/2) of the angle θ; lengths over REACH) with the correlation e^(−1/2). The
+errors of the eleven named arms are most likely with 1 for 12 views, and with 0.7 for 30. With 1.7, σ along the optical
+axis is 9 % larger, and the share of points within 95 % changes by less than its chance."""
 LINK_PER_JOINT = 3e-3 / np.radians(1.0)
 """Assumed ratio (m/rad) of link errors to joint offsets: 0.3 mm with 0.1°, 1 mm with 0.3°."""
 
