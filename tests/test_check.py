@@ -126,7 +126,9 @@ def test_check_names_the_remedy_the_board_and_the_images_that_a_run_names():
     (board,) = [one for one in found.findings if one.kind is FindingKind.BOARD_IN_VIEW]
     assert "--board chessboard:11x8:SIDE" in board.remedy
     plain = check_capture(SHARED / "data/franka_plain_background")
-    assert "as exact as needed, 8 images" in repr(plain), "SIFT registers no image; a run finds learned features"
+    assert "as exact as needed, 8 images" in repr(plain), (
+        "SIFT registers no image; a run finds learned features"
+    )
     belt = check_capture(SHARED / "attacks/scene_belt")
     assert any("objects seem to have moved" in one for one in warnings_of(belt.findings))
     found = check_capture(SHARED / "data/ur_snack_table")
