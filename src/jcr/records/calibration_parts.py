@@ -230,7 +230,7 @@ class PointUncertainty(Checked):
     lateral_95_mm: Spread
     """Bound on the position error across the ray (mm)."""
     along_95_mm: Spread
-    """Bound on the position error along the ray (mm), if the distance is that of the reconstruction."""
+    """Bound on the position error along the ray (mm), for an exact distance."""
     ray_95_deg: Spread
     """Bound on the error of the ray's direction (degrees)."""
     rotation_95_deg: Spread
