@@ -12,14 +12,20 @@ from jcr.calibration.calibrate import calibrate_pose_pairs, calibrate_reconstruc
 from jcr.calibration.checks.images import check_remarks
 from jcr.calibration.hand_eye import solve_hand_eye
 from jcr.calibration.options import CalibrateOptions
-from jcr.calibration.record import Calibration, read_calibration
+from jcr.calibration.record import (
+    Calibration,
+    FailedCalibration,
+    PublishedCalibration,
+    read_calibration,
+    validated,
+)
 from jcr.calibration.summary import summary
 from jcr.calibration.verdict import appended, judged
 from jcr.findings import Finding, FindingKind, sentence
 from jcr.findings.finding import verdict_of, without_consequences
 from jcr.findings.messages import GROUPS
 from jcr.geometry import rotation_exp, transform
-from jcr.records import Intrinsics
+from jcr.records import Intrinsics, PaperResiduals
 from refusal import refused
 from scenes import capture_of, pairs_of, reconstruction_of
 from simulation.problems import hand_eye_problem
@@ -134,6 +140,23 @@ def test_motions_are_not_the_cause_where_images_are_missing(tilt_deg: float):
     found = calibrate_reconstruction(alone, made)
     assert found.findings[0].kind is FindingKind.UNOBSERVABLE
     assert "tilt the wrist" in found.observability.advice[0]
+
+
+def test_a_failure_without_its_reason_and_a_published_result_without_transform_are_refused():
+    """A failed calibration.json that was edited to accepted ended in a traceback."""
+    failed = FailedCalibration(
+        images=(), findings=(replace(example(FindingKind.SLIP), severity="rejects"),)
+    ).as_json()
+    failed |= {"findings": [], "warnings": [], "verdict": "accepted", "converged": True}
+    with refused("no finding states why there is no calibration"):
+        validated(json.loads(json.dumps(failed)), Path("a"))
+    pose, residuals = np.eye(4), PaperResiduals(0.0, 0.0)
+    whole = PublishedCalibration(
+        method="paper", images=(), scale=1.0, residuals=residuals, on_gripper=pose, resting=pose
+    )
+    edited = json.loads(json.dumps(whole.as_json())) | {"gripper_from_camera": None}
+    with refused("the transforms are not those of the mount gripper"):
+        validated(edited, Path("a"))
 
 
 def test_findings_are_in_the_file_and_come_back(tmp_path: Path):

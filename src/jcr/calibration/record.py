@@ -232,6 +232,14 @@ class Outcome:
         """Pose (m) of a fixed camera; raises InputError for one on the gripper, RejectedError without calibration."""
         return self._require(self.on_base, "base")
 
+    def _require_transforms(self) -> None:
+        """Raise InputError unless the fields are possible and exactly the two transforms of the mount are set."""
+        require_fields(self)
+        own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
+        own, other = (own, other) if self.mount == "gripper" else (other, own)
+        if any(one is None for one in own) or any(one is not None for one in other):
+            raise InputError(f"the transforms are not those of the mount {self.mount}")
+
     def _require(self, matrix: Float[ndarray, "4 4"] | None, mount: Mount) -> Float[ndarray, "4 4"]:
         """Return `matrix`; raise InputError if the camera's mount is not `mount`, RejectedError if `matrix` is None."""
         if self.mount != mount:
@@ -306,11 +314,7 @@ class Calibration(Outcome):
 
     def __post_init__(self) -> None:
         """Raise InputError unless the scale is possible and exactly the two transforms of the mount are set."""
-        require_fields(self)
-        own, other = (self.on_gripper, self.resting), (self.on_base, self.carried)
-        own, other = (own, other) if self.mount == "gripper" else (other, own)
-        if any(one is None for one in own) or any(one is not None for one in other):
-            raise InputError(f"the transforms are not those of the mount {self.mount}")
+        self._require_transforms()
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:
@@ -431,6 +435,11 @@ class FailedCalibration(Outcome):
     Fields that only a calibration has, such as `scale`, are None here and null in the file.
     """
 
+    def __post_init__(self) -> None:
+        """Raise InputError unless a finding states why there is no calibration."""
+        if self.verdict != "rejected":
+            raise InputError("no finding states why there is no calibration")
+
     @computed_field
     @property
     def observability(self) -> Observability:
@@ -449,6 +458,10 @@ class PublishedCalibration(Outcome):
 
     scale: Positive = field()
     residuals: PaperResiduals = field()
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless the scale is possible and exactly the two transforms of the mount are set."""
+        self._require_transforms()
 
     @property
     def parent_from_camera(self) -> Float[ndarray, "4 4"]:
